@@ -1,0 +1,1 @@
+"""Banks of filters and the rules that weigh their members."""

@@ -1,0 +1,218 @@
+"""Banks: the same filter over several parameter sets, weighed by a rule; a bank is again a filter.
+
+The members never interact, so several weight rules can watch one set of members: :func:`panel`
+compares rules at the price of one bank.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.banks.weights import (
+    active,
+    bayes,
+    chain,
+    member_log_likelihood,
+    normalise,
+    windowed_reset,
+)
+from jaxnav.estimation.types import Filter, Flag, Gaussian, Info, Input, Obs, WeightRule
+from jaxnav.numerics.linalg import cholesky, solve_lower, symmetrise
+
+
+class BankParams(NamedTuple):
+    """Parameters of a bank.
+
+    Attributes:
+        members: The filter's parameters with a leading model axis ``M`` on every leaf.
+        rule: Parameters of the weight rule; for a :func:`panel`, a mapping by rule name.
+        log_prior: ``(M,)`` log-weights at t0, normalised or not; ``-inf`` leaves a member out;
+            ``None`` is uniform. For a :func:`panel`, a mapping by rule name, or ``None``.
+    """
+
+    members: Any
+    rule: Any
+    log_prior: Any = None
+
+
+class BankState(NamedTuple):
+    """Members' states (leading axis ``M``), the rule's memory, log-weights and the step count."""
+
+    members: Any
+    rule: Any
+    log_weights: Any
+    step: Array
+
+
+class PanelState(NamedTuple):
+    """The state of a panel: as :class:`BankState`, rule and log-weights being mappings by name."""
+
+    members: Any
+    rule: dict[str, Any]
+    log_weights: dict[str, Array]
+    step: Array
+
+
+def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
+    """Return several banks over one set of members, one for each weight rule.
+
+    Parameters are :class:`BankParams` with mappings; ``update`` gives a mapping of
+    :class:`Info` and ``estimate`` one of :class:`Gaussian`, by rule name. With ``fixed`` weights on
+    one member, a single filter takes part in the comparison at no further cost.
+    """
+    names = tuple(rules)
+    estimate_members = jax.vmap(filter.estimate)
+
+    def init(params: BankParams) -> PanelState:
+        members = jax.vmap(filter.init)(params.members)
+        count = jax.tree.leaves(params.members)[0].shape[0]
+        dtype = jax.tree.leaves(members)[0].dtype
+        priors = {name: _log_prior(params.log_prior, name, count, dtype) for name in names}
+        memories = {name: rules[name].init(params.rule[name], priors[name]) for name in names}
+        return PanelState(members, memories, priors, jnp.zeros((), jnp.int32))
+
+    def predict(params: BankParams, state: PanelState, u: Input) -> PanelState:
+        step = state.step + 1
+        members = jax.vmap(filter.predict, in_axes=(0, 0, None))(params.members, state.members, u)
+        log_weights = {
+            name: rules[name].predict(
+                params.rule[name], state.rule[name], state.log_weights[name], step
+            )
+            for name in names
+        }
+        return PanelState(members, state.rule, log_weights, step)
+
+    def update(
+        params: BankParams, state: PanelState, u: Input, obs: Obs
+    ) -> tuple[PanelState, dict[str, Info]]:
+        members, info = jax.vmap(filter.update, in_axes=(0, 0, None, None))(
+            params.members, state.members, u, obs
+        )
+        moved = {
+            name: rules[name].update(
+                params.rule[name], state.rule[name], state.log_weights[name], info, state.step
+            )
+            for name in names
+        }
+        infos = {name: mixture_info(state.log_weights[name], info) for name in names}
+        memories = {name: memory for name, (memory, _) in moved.items()}
+        log_weights = {name: weights for name, (_, weights) in moved.items()}
+        return PanelState(members, memories, log_weights, state.step), infos
+
+    def estimate(state: PanelState) -> dict[str, Gaussian]:
+        members = estimate_members(state.members)
+        return {name: moment_match(state.log_weights[name], members) for name in names}
+
+    return Filter(init, predict, update, estimate)
+
+
+def bank(filter: Filter, rule: WeightRule) -> Filter:
+    """Return the bank of ``filter`` under one weight rule, with parameters :class:`BankParams`.
+
+    The estimate is the moment-matched mixture: the members' covariances and the spread of their
+    means, weighted. The info's log-likelihood is that of the predictive mixture.
+
+    References:
+        Si, Wang, Niu, Eqs. (4)-(18). Zhao et al. (2018), Eqs. (5) and (30), leave the members'
+        covariances out; that covariance tends to zero when one weight tends to one.
+    """
+    single = panel(filter, {"": rule})
+
+    def widen(params: BankParams) -> BankParams:
+        prior = None if params.log_prior is None else {"": params.log_prior}
+        return BankParams(params.members, {"": params.rule}, prior)
+
+    def wide_state(state: BankState) -> PanelState:
+        return PanelState(state.members, {"": state.rule}, {"": state.log_weights}, state.step)
+
+    def narrow(state: PanelState) -> BankState:
+        return BankState(state.members, state.rule[""], state.log_weights[""], state.step)
+
+    def init(params: BankParams) -> BankState:
+        return narrow(single.init(widen(params)))
+
+    def predict(params: BankParams, state: BankState, u: Input) -> BankState:
+        return narrow(single.predict(widen(params), wide_state(state), u))
+
+    def update(params: BankParams, state: BankState, u: Input, obs: Obs) -> tuple[BankState, Info]:
+        moved, infos = single.update(widen(params), wide_state(state), u, obs)
+        return narrow(moved), infos[""]
+
+    def estimate(state: BankState) -> Gaussian:
+        return single.estimate(wide_state(state))[""]
+
+    return Filter(init, predict, update, estimate)
+
+
+def mmae(filter: Filter) -> Filter:
+    """Return multiple-model adaptive estimation: a bank under Bayes' rule (rule parameters ``()``).
+
+    References:
+        Magill (1965), IEEE Trans. Automatic Control 10(4).
+    """
+    return bank(filter, bayes())
+
+
+def immae(filter: Filter, *, smooth: bool = False) -> Filter:
+    """Return improved MMAE: Bayes' rule with a windowed reset.
+
+    The rule's parameters are ``((), WindowedReset(...))``.
+
+    References:
+        Si, Wang, Niu, Eqs. (5)-(18) and step (5); see
+        :func:`~jaxnav.estimation.banks.weights.windowed_reset` for what the paper leaves open.
+    """
+    return bank(filter, chain(bayes(), windowed_reset(smooth=smooth)))
+
+
+def _log_prior(log_prior: Any, name: str, count: int, dtype: Any) -> Array:
+    given = None if log_prior is None else log_prior[name]
+    if given is None:
+        return normalise(jnp.zeros((count,), dtype))
+    return normalise(jnp.asarray(given, dtype))
+
+
+def moment_match(log_weights: Array, members: Gaussian) -> Gaussian:
+    """Return the Gaussian with the mean and covariance of a mixture.
+
+        x = sum w_i x_i,   P = sum w_i (P_i + (x_i - x)(x_i - x)')
+
+    Args:
+        log_weights: ``(M,)`` normalised; members at ``-inf`` have no effect, even if not finite.
+        members: Means ``(M, n)`` and covariances ``(M, n, n)``.
+    """
+    used = active(log_weights)
+    w = jnp.where(used, jnp.exp(log_weights), 0)
+    means = jnp.where(used[:, None], members.mean, 0)
+    covs = jnp.where(used[:, None, None], members.cov, 0)
+    mean = jnp.sum(w[:, None] * means, axis=0)
+    spread = jnp.where(used[:, None], means - mean[None], 0)
+    outer = spread[:, :, None] * spread[:, None, :]
+    return Gaussian(mean, jnp.sum(w[:, None, None] * (covs + outer), axis=0))
+
+
+def mixture_info(log_weights: Array, info: Info) -> Info:
+    """Return the info of a bank from its predictive log-weights ``(M,)`` and its members' info.
+
+    The log-likelihood is the mixture's, ``log sum w_i N(nu_i; 0, S_i)``; innovation, its covariance
+    and the NIS are those of the moment-matched prediction.
+    """
+    evidence = jax.nn.logsumexp(log_weights + member_log_likelihood(info.log_likelihood))
+    vetoed = ~jnp.isfinite(evidence)
+    innovation, S = moment_match(log_weights, Gaussian(info.innovation, info.innovation_cov))
+    root = cholesky(symmetrise(S))
+    whitened = solve_lower(root.factor, innovation)
+    used = active(log_weights)
+    raised = jnp.where(vetoed, int(Flag.ALL_MODELS_VETOED), 0).astype(jnp.int32)
+    bits = jnp.where(used, info.flags, 0)
+    return Info(
+        innovation=innovation,
+        innovation_cov=S,
+        log_likelihood=jnp.where(vetoed, 0, evidence),
+        nis=jnp.sum(whitened * whitened),
+        iterations=jnp.max(jnp.where(used, info.iterations, 0)),
+        flags=jax.lax.reduce(bits, jnp.zeros((), jnp.int32), jax.lax.bitwise_or, (0,)) | raised,
+    )

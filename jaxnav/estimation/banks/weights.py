@@ -1,0 +1,238 @@
+"""Weight rules: how a bank's log-weights move over a step and with its data.
+
+A rule is a small filter over the model index (:class:`~jaxnav.estimation.types.WeightRule`); rules
+compose with :func:`chain`. All weights are log-weights and leave each rule normalised; ``-inf``
+marks a member that takes no part and stays ``-inf``.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.types import Info, WeightRule
+
+
+def normalise(log_weights: Array) -> Array:
+    """Return log-weights ``(M,)`` whose weights sum to one; all ``-inf`` stays as it is."""
+    total = jax.nn.logsumexp(log_weights)
+    return log_weights - jnp.where(jnp.isfinite(total), total, 0)
+
+
+def active(log_weights: Array) -> Array:
+    """Return which members ``(M,)`` take part."""
+    return log_weights > -jnp.inf
+
+
+def uniform(log_weights: Array) -> Array:
+    """Return equal log-weights ``(M,)`` over the members that take part."""
+    members = active(log_weights)
+    return jnp.where(members, -jnp.log(jnp.sum(members).astype(log_weights.dtype)), -jnp.inf)
+
+
+def member_log_likelihood(log_likelihood: Array) -> Array:
+    """Return the members' log-likelihoods ``(M,)`` with a failed member's NaN as a veto."""
+    return jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
+
+
+def _stateless(params: Any, log_weights: Array) -> tuple[()]:
+    del params, log_weights
+    return ()
+
+
+def _stay(params: Any, state: Any, log_weights: Array, k: Array) -> Array:
+    del params, state, k
+    return log_weights
+
+
+def _ignore_data(
+    params: Any, state: Any, log_weights: Array, info: Info, k: Array
+) -> tuple[Any, Array]:
+    del params, info, k
+    return state, log_weights
+
+
+def fixed() -> WeightRule:
+    """Return the rule that keeps the prior weights: one member alone, or a constant mixture."""
+    return WeightRule(_stateless, _stay, _ignore_data)
+
+
+def _bayes_step(log_weights: Array, info: Info) -> Array:
+    posterior = log_weights + member_log_likelihood(info.log_likelihood)
+    vetoed = ~jnp.any(active(posterior))
+    return normalise(jnp.where(vetoed, log_weights, posterior))
+
+
+def bayes() -> WeightRule:
+    """Return Bayes' rule: each weight is multiplied by its member's likelihood. No parameters.
+
+    A step in which no member has a finite likelihood keeps the weights.
+
+    References:
+        Magill (1965); Si, Wang, Niu, Eqs. (14)-(15), with the weights in the log domain.
+    """
+
+    def update(
+        params: Any, state: Any, log_weights: Array, info: Info, k: Array
+    ) -> tuple[Any, Array]:
+        del params, k
+        return state, _bayes_step(log_weights, info)
+
+    return WeightRule(_stateless, _stay, update)
+
+
+def floor() -> WeightRule:
+    """Return the lower bound on weights; the parameter is the bound, in (0, 1/M).
+
+    Weights below the bound are raised to it and all are normalised again, so a model that was ruled
+    out can come back within a few steps.
+
+    References:
+        Maybeck and Stevens (1991), IEEE Trans. AES 27(3).
+    """
+
+    def update(
+        params: Array, state: Any, log_weights: Array, info: Info, k: Array
+    ) -> tuple[Any, Array]:
+        del info, k
+        raised = jnp.maximum(log_weights, jnp.log(params))
+        return state, normalise(jnp.where(active(log_weights), raised, -jnp.inf))
+
+    return WeightRule(_stateless, _stay, update)
+
+
+def forget() -> WeightRule:
+    """Return exponential forgetting; the parameter in (0, 1] multiplies the log-weights each step.
+
+    The weights before the data become ``w**forgetting``, normalised: evidence that is ``n`` steps
+    old counts ``forgetting**n``.
+    """
+
+    def predict(params: Array, state: Any, log_weights: Array, k: Array) -> Array:
+        del state, k
+        members = active(log_weights)
+        faded = params * jnp.where(members, log_weights, 0)
+        return normalise(jnp.where(members, faded, -jnp.inf))
+
+    return WeightRule(_stateless, predict, _ignore_data)
+
+
+def markov() -> WeightRule:
+    """Return Markov switching between models; the parameter is the probability to switch per step.
+
+    Before the data, ``w_i = (1 - p) w_i + p (1 - w_i) / (M - 1)``: the model index is a Markov chain
+    that leaves its state with probability ``p`` for any other one. The members do not interact; the
+    rule is the weight recursion of an interacting bank without its mixing step.
+    """
+
+    def predict(params: Array, state: Any, log_weights: Array, k: Array) -> Array:
+        del state, k
+        members = active(log_weights)
+        others = jnp.maximum(jnp.sum(members) - 1, 1).astype(log_weights.dtype)
+        stay = jnp.where(members, log_weights, 0) + jnp.log1p(-params)
+        weight = jnp.where(members, jnp.exp(log_weights), 0)
+        elsewhere = jnp.maximum(1 - weight, jnp.finfo(weight.dtype).eps)
+        arrive = jnp.log(params) - jnp.log(others) + jnp.log(elsewhere)
+        return normalise(jnp.where(members, jnp.logaddexp(stay, arrive), -jnp.inf))
+
+    return WeightRule(_stateless, predict, _ignore_data)
+
+
+class WindowedReset(NamedTuple):
+    """Parameters of :func:`windowed_reset`.
+
+    Attributes:
+        period: Steps between two assessments, at least one.
+        threshold: Weight in (0, 1] above which the leading model is put to the test.
+        temperature: Width of the smooth threshold; not used by the hard rule.
+    """
+
+    period: Array | float
+    threshold: Array | float
+    temperature: Array | float = 0.05
+
+
+def windowed_reset(*, smooth: bool = False) -> WeightRule:
+    """Return the reset of IMMAE: start anew when a short memory disagrees with the long one.
+
+    A second set of weights starts uniform every ``period`` steps. At the end of a period, if the
+    largest weight exceeds ``threshold`` and the second set prefers another model, the weights are
+    made uniform; the second set always is.
+
+    With ``smooth=True`` every step has a gradient: the second set forgets with the time constant
+    ``period`` instead of starting anew, and a share
+    ``sigmoid((max w - threshold) / temperature) (1 - <w, w2>) / period`` of the weights is replaced
+    by the uniform ones.
+
+    References:
+        Si, Wang, Niu, Eq. (16) and step (5). As printed, Eqs. (15) and (16) are the same recursion;
+        they can differ only if the second set starts anew every period whether or not the first is
+        reset, which is what is done here. The paper gives neither period nor threshold.
+    """
+    return WeightRule(_window_init, _stay, _smooth_reset if smooth else _hard_reset)
+
+
+def _window_init(params: WindowedReset, log_weights: Array) -> Array:
+    del params
+    return uniform(log_weights)
+
+
+def _hard_reset(
+    params: WindowedReset, state: Array, log_weights: Array, info: Info, k: Array
+) -> tuple[Array, Array]:
+    window = _bayes_step(state, info)
+    even = uniform(log_weights)
+    assess = jnp.mod(k.astype(log_weights.dtype), params.period) < 1
+    confident = jnp.max(log_weights) > jnp.log(params.threshold)
+    mismatch = jnp.argmax(log_weights) != jnp.argmax(window)
+    reset = assess & confident & mismatch
+    return jnp.where(assess, even, window), jnp.where(reset, even, log_weights)
+
+
+def _smooth_reset(
+    params: WindowedReset, state: Array, log_weights: Array, info: Info, k: Array
+) -> tuple[Array, Array]:
+    del k
+    members = active(log_weights)
+    fading = 1 - 1 / params.period
+    faded = jnp.where(members, fading * jnp.where(members, state, 0), -jnp.inf)
+    window = _bayes_step(faded, info)
+    w = jnp.exp(log_weights)
+    confident = jax.nn.sigmoid((jnp.max(w) - params.threshold) / params.temperature)
+    mismatch = 1 - jnp.sum(w * jnp.exp(window))
+    share = confident * jnp.maximum(mismatch, jnp.finfo(w.dtype).eps) / params.period
+    even = jnp.where(members, jnp.log(share) + uniform(log_weights), -jnp.inf)
+    kept = jnp.log1p(-share) + jnp.where(members, log_weights, 0)
+    mixed = jnp.logaddexp(kept, jnp.where(members, even, 0))
+    return window, normalise(jnp.where(members, mixed, -jnp.inf))
+
+
+def chain(*rules: WeightRule) -> WeightRule:
+    """Return the rules one after another; parameters and state are tuples, one entry a rule."""
+
+    def init(params: tuple[Any, ...], log_weights: Array) -> tuple[Any, ...]:
+        return tuple(rule.init(own, log_weights) for rule, own in zip(rules, params, strict=True))
+
+    def predict(params: tuple, state: tuple, log_weights: Array, k: Array) -> Array:
+        for rule, own, memory in zip(rules, params, state, strict=True):
+            log_weights = rule.predict(own, memory, log_weights, k)
+        return log_weights
+
+    def update(
+        params: tuple, state: tuple, log_weights: Array, info: Info, k: Array
+    ) -> tuple[tuple, Array]:
+        memories: list[Any] = []
+        for rule, own, memory in zip(rules, params, state, strict=True):
+            memory, log_weights = rule.update(own, memory, log_weights, info, k)
+            memories.append(memory)
+        return tuple(memories), log_weights
+
+    return WeightRule(init, predict, update)
+
+
+RULES: dict[str, Callable[..., WeightRule]] = {
+    rule.__name__: rule for rule in (fixed, bayes, floor, forget, markov, windowed_reset, chain)
+}
+"""The rules by name, for listing."""

@@ -1,0 +1,1 @@
+"""Single filters; each is a :class:`~jaxnav.estimation.types.Filter` built from a model."""

@@ -1,0 +1,134 @@
+"""Runs over time: the only ``lax.scan`` over filter time."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.types import Filter, Input, Model, Obs, Params
+
+Recorder = Callable[[Any, Any], Any]
+
+
+class Trace(NamedTuple):
+    """What a run returns: ``record``'s pytree with a leading time axis, and the state at the end."""
+
+    record: Any
+    final: Any
+
+
+def run(
+    filter: Filter,
+    params: Params,
+    inputs: Input,
+    observations: Obs,
+    *,
+    record: Recorder | None = None,
+    segment: int = 0,
+) -> Trace:
+    """Run a filter over time: step k predicts over ``[t_{k-1}, t_k]``, then updates at ``t_k``.
+
+    Args:
+        filter: The filter or bank.
+        params: Its parameters.
+        inputs: Inputs of the steps on the filter's clock, a leading time axis ``T`` on every leaf.
+        observations: ``z`` ``(T, m)`` and ``valid`` ``(T, m)``; a sensor of a lower rate is not
+            valid in the steps between.
+        record: ``(state, info) -> pytree`` of what to keep per step; the default keeps
+            ``(filter.estimate(state), info)``.
+        segment: Length of the segments whose inside is computed again by the backward pass, so that
+            a gradient holds ``T / segment + segment`` states instead of ``T``; 0 keeps all. About
+            ``sqrt(T)`` is best.
+
+    Returns:
+        The trace.
+
+    Raises:
+        ValueError: If the leading axes of inputs and observations differ.
+    """
+    steps = {leaf.shape[0] for leaf in jax.tree.leaves((inputs, observations))}
+    if len(steps) != 1:
+        raise ValueError(
+            f"inputs and observations have {sorted(steps)} steps; "
+            "every leaf needs the same leading time axis"
+        )
+    return _run(filter, record, segment, params, inputs, observations)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _run(
+    filter: Filter,
+    record: Recorder | None,
+    segment: int,
+    params: Params,
+    inputs: Input,
+    observations: Obs,
+) -> Trace:
+    def step(state: Any, now: tuple[Input, Obs]) -> tuple[Any, Any]:
+        u, obs = now
+        state, info = filter.update(params, filter.predict(params, state, u), u, obs)
+        kept = (filter.estimate(state), info) if record is None else record(state, info)
+        return state, kept
+
+    final, kept = scan_in_segments(step, filter.init(params), (inputs, observations), segment)
+    return Trace(kept, final)
+
+
+def scan_in_segments(
+    step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any, segment: int
+) -> tuple[Any, Any]:
+    """Scan ``step`` over the leading axis of ``xs``, checkpointing segments of a given length.
+
+    The values are those of ``lax.scan``; a remainder shorter than a segment is scanned at the end.
+    """
+    length = jax.tree.leaves(xs)[0].shape[0]
+    if not 0 < segment < length:
+        return jax.lax.scan(step, carry, xs)
+    whole = length // segment
+
+    @jax.checkpoint
+    def inner(carry: Any, chunk: Any) -> tuple[Any, Any]:
+        return jax.lax.scan(step, carry, chunk)
+
+    def fold(leaf: Array) -> Array:
+        return leaf[: whole * segment].reshape(whole, segment, *leaf.shape[1:])
+
+    carry, kept = jax.lax.scan(inner, carry, jax.tree.map(fold, xs))
+    kept = jax.tree.map(lambda leaf: leaf.reshape(whole * segment, *leaf.shape[2:]), kept)
+    if whole * segment == length:
+        return carry, kept
+    carry, rest = jax.lax.scan(step, carry, jax.tree.map(lambda leaf: leaf[whole * segment :], xs))
+    return carry, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), kept, rest)
+
+
+def simulate(
+    model: Model,
+    params: Params,
+    start: Any,
+    inputs: Input,
+    process_noise: Array,
+    observation_noise: Array,
+) -> tuple[Any, Array]:
+    """Simulate a state-space model: states at ``t_1 .. t_T`` and their noisy observations.
+
+    Args:
+        model: The model; ``retract`` applies the process noise.
+        params: Its parameters (without the filter's prior).
+        start: State at t0.
+        inputs: Inputs of the steps, leading axis ``T``.
+        process_noise: ``(T, n)`` samples in tangent coordinates.
+        observation_noise: ``(T, m)`` samples, added to the observation.
+
+    Returns:
+        The states, leading axis ``T``, and the observations ``(T, m)``.
+    """
+
+    def step(x: Any, now: tuple[Input, Array, Array]) -> tuple[Any, tuple[Any, Array]]:
+        u, w, v = now
+        x = model.retract(model.transition(params, x, u), w)
+        return x, (x, model.observe(params, x, u) + v)
+
+    return jax.lax.scan(step, start, (inputs, process_noise, observation_noise))[1]

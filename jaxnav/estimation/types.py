@@ -1,0 +1,195 @@
+"""The contracts of the algebra: models, filters, weight rules and what they exchange.
+
+A filter is a ``NamedTuple`` of pure functions; its parameters are one pytree that travels as an
+argument and is never closed over. So a bank is a ``vmap`` over parameters, a Monte Carlo study a
+``vmap`` over keys, and tuning a ``grad`` through both.
+"""
+
+from collections.abc import Callable
+from enum import IntFlag
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+Vector = Float[Array, " n"]
+Matrix = Float[Array, "n n"]
+Scalar = Float[Array, ""]
+Mask = Bool[Array, " m"]
+Params = Any
+Point = Any
+Input = Any
+
+
+class Flag(IntFlag):
+    """Health bits of one update, combined in :attr:`Info.flags`.
+
+    Attributes:
+        NO_OBSERVATION: No channel was valid: the step was a prediction only.
+        NOT_POSITIVE_DEFINITE: The innovation covariance could not be factored: the update was
+            skipped.
+        ILL_CONDITIONED: The factorisation kept fewer than about three digits; the update was made.
+        ALL_MODELS_VETOED: No member of a bank had a finite likelihood: the weights were kept.
+    """
+
+    NO_OBSERVATION = 1
+    NOT_POSITIVE_DEFINITE = 2
+    ILL_CONDITIONED = 4
+    ALL_MODELS_VETOED = 8
+
+
+class Gaussian(NamedTuple):
+    """A mean (a point of the state's manifold) and a covariance ``(n, n)`` in its tangent space."""
+
+    mean: Point
+    cov: Matrix
+
+
+class Obs(NamedTuple):
+    """An observation: values ``z`` ``(m,)`` and which channels arrived, ``valid`` ``(m,)``.
+
+    A missing channel is a ``False``; its value is never used, not even in a product with zero.
+    """
+
+    z: Float[Array, " m"]
+    valid: Mask
+
+
+class Info(NamedTuple):
+    """What one update tells a human; the shapes do not depend on which channels were valid.
+
+    Attributes:
+        innovation: ``(m,)`` measured minus predicted; zero in invalid channels.
+        innovation_cov: ``(m, m)``; an invalid channel has the row of the identity.
+        log_likelihood: Log-density of the valid channels given the past [nats].
+        nis: Normalised innovation squared, chi-square with ``sum(valid)`` degrees of freedom.
+        iterations: Number of iterations of the update.
+        flags: Sum of :class:`Flag`.
+    """
+
+    innovation: Float[Array, " m"]
+    innovation_cov: Float[Array, "m m"]
+    log_likelihood: Scalar
+    nis: Scalar
+    iterations: Int[Array, ""]
+    flags: Int[Array, ""]
+
+
+def _difference(z: Array, z_pred: Array) -> Array:
+    return z - z_pred
+
+
+def _add(x: Array, dx: Array) -> Array:
+    return x + dx
+
+
+def _subtract(x: Array, y: Array) -> Array:
+    return y - x
+
+
+class Model(NamedTuple):
+    """A state-space model on a manifold; every function is pure and takes the parameters first.
+
+    Write ``transition`` with multiply-adds over blocks (:func:`~jaxnav.numerics.linalg.matmul`)
+    rather than as one dense product: the linear filters never form the transition matrix, they push
+    the columns of the covariance through this function, so its structure is what they pay for.
+
+    Attributes:
+        transition: ``(params, x, u) -> x`` over one step; ``u`` holds the inputs of the step.
+        process_noise: ``(params, x, u) -> (n, n)`` discrete covariance in tangent coordinates.
+        observe: ``(params, x, u) -> (m,)`` the stacked channels of all sensors.
+        observation_noise: ``(params, x, u) -> (m, m)`` or ``(m,)``, a covariance or its diagonal.
+        residual: ``(z, z_pred) -> (m,)``; the default subtracts.
+        retract: ``(x, dx) -> x``; the default adds.
+        local: ``(x, y) -> dx`` with ``retract(x, dx) == y``; the default subtracts.
+        jacobians: ``(params, x, u) -> (Phi, H)``, or ``None`` for automatic differentiation.
+    """
+
+    transition: Callable[[Params, Point, Input], Point]
+    process_noise: Callable[[Params, Point, Input], Matrix]
+    observe: Callable[[Params, Point, Input], Array]
+    observation_noise: Callable[[Params, Point, Input], Array]
+    residual: Callable[[Array, Array], Array] = _difference
+    retract: Callable[[Point, Array], Point] = _add
+    local: Callable[[Point, Point], Array] = _subtract
+    jacobians: Callable[[Params, Point, Input], tuple[Array, Array]] | None = None
+
+
+class FilterParams(NamedTuple):
+    """The parameters of a single filter: what may differ between members of a bank, or be tuned.
+
+    Attributes:
+        model: The parameters of the :class:`Model`'s functions.
+        initial: Mean and covariance at t0.
+    """
+
+    model: Params
+    initial: Gaussian
+
+
+class Filter(NamedTuple):
+    """A recursive estimator as four pure functions; a bank of filters is one too.
+
+    Attributes:
+        init: ``(params) -> state`` at t0.
+        predict: ``(params, state, u) -> state`` over one step.
+        update: ``(params, state, u, obs) -> (state, info)`` with the same step's input.
+        estimate: ``(state) -> Gaussian``.
+    """
+
+    init: Callable[[Params], Any]
+    predict: Callable[[Params, Any, Input], Any]
+    update: Callable[[Params, Any, Input, Obs], tuple[Any, Any]]
+    estimate: Callable[[Any], Any]
+
+
+class WeightPredict(Protocol):
+    """Moves log-weights ``(M,)`` over a step, before its data: forgetting, switching."""
+
+    def __call__(self, params: Params, state: Any, log_weights: Array, k: Array) -> Array:
+        """Return normalised log-weights; ``k`` counts steps from 1."""
+        ...
+
+
+class WeightUpdate(Protocol):
+    """Moves log-weights ``(M,)`` with the members' :class:`Info` of the step."""
+
+    def __call__(
+        self, params: Params, state: Any, log_weights: Array, info: Info, k: Array
+    ) -> tuple[Any, Array]:
+        """Return the rule's state and normalised log-weights."""
+        ...
+
+
+class WeightRule(NamedTuple):
+    """How a bank weighs its members: itself a small filter over the model index.
+
+    A weight of ``-inf`` marks a member that takes no part; no rule revives it.
+
+    Attributes:
+        init: ``(params, log_weights) -> state``.
+        predict: See :class:`WeightPredict`; what it returns weighs the predictive likelihood.
+        update: See :class:`WeightUpdate`.
+    """
+
+    init: Callable[[Params, Array], Any]
+    predict: WeightPredict
+    update: WeightUpdate
+
+
+def observed(z: Array) -> Obs:
+    """Return observations ``(..., m)`` in which every channel with a finite value is valid.
+
+    For recorded data, where NaN or an infinity marks a lost channel. The mask then depends on the
+    data, so a batch of runs cannot share its covariance recursion; simulations that lose no data
+    should build ``Obs(z, valid)`` with one mask for all runs.
+    """
+    finite = jnp.isfinite(z)
+    return Obs(jnp.where(finite, z, 0), finite)
+
+
+def replicate(params: Params, count: int) -> Params:
+    """Return ``params`` with a leading model axis of length ``count`` on every leaf."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), params)

@@ -1,0 +1,1 @@
+"""The physics of aided inertial navigation; of the algebra it knows the types alone."""

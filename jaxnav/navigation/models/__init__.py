@@ -1,0 +1,1 @@
+"""State-space models of navigation systems, as :class:`~jaxnav.estimation.types.Model`."""

@@ -1,0 +1,1 @@
+"""True motion of vehicles, and the perfect sensor increments that belong to it."""

@@ -1,0 +1,158 @@
+"""Small-matrix kernels that XLA can fuse: no LAPACK call, no batched ``dot`` for small sizes.
+
+A batched ``dot`` of 3x3 blocks and a LAPACK call per step each cost more than the arithmetic of a
+whole Kalman step, so the sizes a navigation filter meets (three axes, up to six measurements) are
+written out as multiply-adds over Python loops that unroll at trace time.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+UNROLL_LIMIT = 6
+"""Largest size that is unrolled; above it the general routines of JAX take over."""
+
+
+def symmetrise(A: Array) -> Array:
+    """Return the symmetric part ``(A + A') / 2`` of a matrix ``(n, n)``."""
+    return 0.5 * (A + A.T)
+
+
+def matmul(A: Array, B: Array) -> Array:
+    """Return ``A @ B`` as a sum of outer products, unrolled over a small inner dimension.
+
+    Args:
+        A: Left factor ``(m, k)``.
+        B: Right factor ``(k, n)`` or ``(k,)``.
+
+    Returns:
+        The product ``(m, n)`` or ``(m,)``.
+    """
+    inner = A.shape[1]
+    if inner == 0 or inner > UNROLL_LIMIT:
+        return A @ B
+    if B.ndim == 1:
+        return sum((A[:, j] * B[j] for j in range(1, inner)), A[:, 0] * B[0])
+    return sum(
+        (A[:, j][:, None] * B[j][None] for j in range(1, inner)),
+        A[:, 0][:, None] * B[0][None],
+    )
+
+
+def safe_norm(x: Array) -> Array:
+    """Return the Euclidean norm of ``(n,)`` with a zero gradient, not NaN, at the origin."""
+    squared = jnp.sum(x * x)
+    nonzero = squared > 0
+    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1)), 0)
+
+
+class Cholesky(NamedTuple):
+    """Lower Cholesky factor ``L L' = S`` with the health of the factorisation.
+
+    Attributes:
+        factor: ``(m, m)`` lower factor; a finite stand-in where ``S`` is not positive definite.
+        positive_definite: Whether every pivot was positive.
+        reciprocal_pivot: Smallest ratio of a pivot to its diagonal entry: 1 for a diagonal matrix,
+            about the machine epsilon when the factor has lost all its digits.
+    """
+
+    factor: Array
+    positive_definite: Array
+    reciprocal_pivot: Array
+
+
+def cholesky(S: Array) -> Cholesky:
+    """Factor a symmetric matrix ``(m, m)``; a failed factorisation is reported, never NaN.
+
+    The factor of an indefinite matrix is finite and differentiable (non-positive pivots are
+    replaced by one before the root), so a caller can select against it without poisoning gradients.
+    """
+    m = S.shape[0]
+    if m > UNROLL_LIMIT:
+        return _lapack_cholesky(S)
+    L: list[list[Array]] = []
+    positive = jnp.array(True)
+    ratio = jnp.ones((), S.dtype)
+    for i in range(m):
+        row: list[Array] = []
+        for j in range(i):
+            row.append((S[i, j] - _dot(row[:j], L[j][:j])) / L[j][j])
+        pivot = S[i, i] - _dot(row, row)
+        good = pivot > 0
+        positive = positive & good
+        ratio = jnp.minimum(ratio, jnp.where(good, pivot / jnp.where(good, S[i, i], 1), 0))
+        row.append(jnp.sqrt(jnp.where(good, pivot, 1)))
+        L.append(row)
+    zero = jnp.zeros((), S.dtype)
+    factor = jnp.stack([jnp.stack(row + [zero] * (m - len(row))) for row in L])
+    return Cholesky(factor, positive, ratio)
+
+
+def _lapack_cholesky(S: Array) -> Cholesky:
+    trial = jax.lax.stop_gradient(jnp.linalg.cholesky(S))
+    positive = jnp.all(jnp.isfinite(trial))
+    factor = jnp.linalg.cholesky(jnp.where(positive, S, jnp.eye(S.shape[0], dtype=S.dtype)))
+    ratio = jnp.min(jnp.diag(factor) ** 2 / jnp.where(positive, jnp.diag(S), 1))
+    return Cholesky(factor, positive, jnp.where(positive, ratio, 0))
+
+
+def _dot(a: list[Array], b: list[Array]) -> Array | int:
+    return sum((x * y for x, y in zip(a, b, strict=True)), 0)
+
+
+def solve_lower(L: Array, B: Array) -> Array:
+    """Return ``inv(L) B`` by forward substitution; ``L`` ``(m, m)``, ``B`` ``(m, n)`` or ``(m,)``."""
+    m = L.shape[0]
+    if m > UNROLL_LIMIT:
+        return jax.scipy.linalg.solve_triangular(L, B, lower=True)
+    rows: list[Array] = []
+    for i in range(m):
+        rows.append((B[i] - sum(L[i, j] * rows[j] for j in range(i))) / L[i, i])
+    return jnp.stack(rows)
+
+
+def solve_lower_transposed(L: Array, B: Array) -> Array:
+    """Return ``inv(L') B`` by back substitution; shapes as in :func:`solve_lower`."""
+    m = L.shape[0]
+    if m > UNROLL_LIMIT:
+        return jax.scipy.linalg.solve_triangular(L.T, B, lower=False)
+    rows: dict[int, Array] = {}
+    for i in reversed(range(m)):
+        rows[i] = (B[i] - sum(L[j, i] * rows[j] for j in range(i + 1, m))) / L[i, i]
+    return jnp.stack([rows[i] for i in range(m)])
+
+
+def log_det(L: Array) -> Array:
+    """Return ``log|S|`` from the lower Cholesky factor ``L`` ``(m, m)`` of ``S``."""
+    return 2 * jnp.sum(jnp.log(jnp.diag(L)))
+
+
+def tria(A: Array) -> Array:
+    """Return the lower-triangular ``L`` ``(n, n)`` with ``L L' = A A'`` for a wide ``A`` ``(n, k)``.
+
+    The diagonal is non-negative, which makes the factor unique for a full-rank ``A``. Uses QR, whose
+    derivative exists when ``A`` has full row rank and ``k >= n``.
+    """
+    R = jnp.linalg.qr(A.T, mode="r")
+    signs = jnp.where(jnp.diag(R) < 0, -1, 1).astype(A.dtype)
+    return (R * signs[:, None]).T
+
+
+def semidefinite_root(A: Array) -> Array:
+    """Return a lower ``L`` ``(n, n)`` with ``L L' = A`` for a positive semi-definite ``A``.
+
+    Columns whose pivot is not positive are zero, so covariances with states that carry no noise are
+    factored exactly; the gradient with respect to such a zero pivot is zero.
+    """
+    n = A.shape[0]
+    rows = jnp.arange(n)
+    columns: list[Array] = []
+    for j in range(n):
+        good = A[j, j] > 0
+        root = jnp.sqrt(jnp.where(good, A[j, j], 1))
+        column = jnp.where(good & (rows >= j), A[:, j] / root, 0)
+        A = A - column[:, None] * column[None, :]
+        columns.append(column)
+    return jnp.stack(columns, axis=1)

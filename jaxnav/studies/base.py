@@ -1,0 +1,84 @@
+"""What every study is: scenarios of a configuration, a result, claims and their verdicts."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+class ConfigError(ValueError):
+    """A parameter outside what is accepted; the message says which, its value and the range."""
+
+
+def require(condition: bool, name: str, value: object, accepted: str) -> None:
+    """Raise :class:`ConfigError` with one sentence unless the condition holds."""
+    if not condition:
+        raise ConfigError(f"{name} is {value}; it must be {accepted}")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of a paper, what was measured, and the verdict.
+
+    Attributes:
+        id: Stable identifier.
+        text: The claim in one sentence.
+        published: The published number, or ``None`` where the paper gives none.
+        measured: The measured number.
+        ci95: 95 % interval of the measured number over paired runs, or ``None``.
+        verdict: ``reproduced``, ``not reproduced`` or ``not testable``.
+        why: What the verdict rests on.
+    """
+
+    id: str
+    text: str
+    published: float | None
+    measured: float | None
+    ci95: tuple[float, float] | None
+    verdict: str
+    why: str
+
+
+def verdict(holds: bool) -> str:
+    """Return the word for a claim that holds or does not."""
+    return "reproduced" if holds else "not reproduced"
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """One scenario of a study, ready to be written and printed.
+
+    Attributes:
+        study: Name of the study.
+        scenario: Name of the scenario.
+        runs: Number of runs.
+        seed: Root seed.
+        config: The configuration as plain values.
+        methods: Per method id, the measures of ``summary.json``.
+        published: The paper's numbers: ``source`` and ``methods``.
+        claims: The claims with their verdicts.
+        arrays: Named arrays for ``arrays.npz`` and the figures; the first axis of each is named in
+            ``dims``.
+        dims: Per array, the names of its axes.
+        notes: Sentences for the reader of the table.
+    """
+
+    study: str
+    scenario: str
+    runs: int
+    seed: int
+    config: dict[str, Any]
+    methods: dict[str, dict[str, Any]]
+    published: dict[str, Any]
+    claims: list[Claim]
+    arrays: dict[str, Any] = field(default_factory=dict)
+    dims: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def diverged(self) -> int:
+        """The largest number of diverged runs of any method."""
+        return max((int(m.get("diverged", 0)) for m in self.methods.values()), default=0)
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """Return a configuration as a dictionary of plain values."""
+    return {f.name: getattr(config, f.name) for f in fields(config)}

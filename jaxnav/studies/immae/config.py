@@ -1,0 +1,177 @@
+"""Configuration of the study ``immae``: Table 1 of the paper and what the paper leaves open."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from jaxnav.studies.base import require
+
+SCENARIOS = {
+    "matched-noise": "simulation 1: true noise Q0 throughout, single Kalman filter at 4 Q0",
+    "noise-step": "simulation 2: true noise Q0, 10 Q0, Q0 in thirds, single Kalman filter at Q0",
+}
+
+
+@dataclass(frozen=True)
+class ImmaeConfig:
+    """SINS/CNS attitude with process noise that is unknown or changes (Si, Wang, Niu).
+
+    Attributes:
+        scenario: Simulation of the paper to run; "all" runs both.
+        runs: Monte Carlo runs.
+        seed: Root seed; run i is the same for any number of runs.
+        chain: "sins" mechanises noisy increments and filters the errors of that solution; "linear"
+            simulates the error model itself.
+        initial: "table" starts every run at the errors of Table 1; "drawn" draws initial errors,
+            drift and bias from P0, as consistency statistics need.
+        duration_s: Flight time [s].
+        ins_rate_hz: Output rate of the inertial sensors [Hz].
+        filter_period_s: Period of the filter and of the star tracker [s].
+        initial_pitch_deg: Pitch on the rail [deg].
+        latitude_deg: Geodetic latitude of the launch point [deg]; sets the Earth's radius.
+        longitude_deg: Longitude of the launch point [deg]; without effect on a non-rotating Earth.
+        gyro_noise_deg_h: Standard deviation of one gyro sample [deg/h].
+        accel_noise_ug: Standard deviation of one accelerometer sample [micro g].
+        gyro_drift_deg_h: Constant gyro drift, each axis [deg/h].
+        accel_bias_ug: Constant accelerometer bias, each axis [micro g].
+        star_noise_arcsec: Standard deviation of the star tracker, each axis [arcsec].
+        initial_misalignment_arcsec: Initial misalignment, each axis [arcsec].
+        p0_attitude_arcsec: Prior standard deviation of the misalignment [arcsec].
+        p0_velocity: Prior standard deviation of the velocity [m/s].
+        p0_position: Prior standard deviation of the position [m].
+        p0_drift_deg_h: Prior standard deviation of the gyro drift [deg/h].
+        p0_bias_ug: Prior standard deviation of the accelerometer bias [micro g].
+        theta: Factors on Q0 of the bank's models.
+        kf_theta: Factor on Q0 of the single Kalman filter; the default is the scenario's.
+        step_theta: Factor on the true Q0 in the middle third of "noise-step".
+        reset_period_s: Period T of IMMAE's assessment [s]; not given in the paper.
+        reset_threshold: Threshold of IMMAE's assessment in (0, 1]; not given in the paper.
+        weight_floor: Lower bound of the "floor" bank's weights.
+        switching: Probability per filter period that the "markov" bank's model changes.
+    """
+
+    scenario: Literal["matched-noise", "noise-step", "all"] = "noise-step"
+    runs: int = 100
+    seed: int = 0
+    chain: Literal["sins", "linear"] = "sins"
+    initial: Literal["table", "drawn"] = "table"
+    duration_s: float = 600.0
+    ins_rate_hz: float = 100.0
+    filter_period_s: float = 0.05
+    initial_pitch_deg: float = 90.0
+    latitude_deg: float = 39.98
+    longitude_deg: float = 116.34
+    gyro_noise_deg_h: float = 1.0
+    accel_noise_ug: float = 500.0
+    gyro_drift_deg_h: float = 0.5
+    accel_bias_ug: float = 100.0
+    star_noise_arcsec: float = 1.0
+    initial_misalignment_arcsec: tuple[float, float, float] = (10.0, 6.0, 10.0)
+    p0_attitude_arcsec: float = 10.0
+    p0_velocity: float = 0.1
+    p0_position: float = 5.0
+    p0_drift_deg_h: float = 0.5
+    p0_bias_ug: float = 500.0
+    theta: tuple[float, ...] = (1.0, 10.0, 100.0, 1000.0, 10000.0)
+    kf_theta: float | None = None
+    step_theta: float = 10.0
+    reset_period_s: float = 10.0
+    reset_threshold: float = 0.9
+    weight_floor: float = 1e-6
+    switching: float = 1e-4
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing.
+
+        Raises:
+            ConfigError: With one sentence naming the field, its value and what is accepted.
+        """
+        for name in ("scenario", "chain", "initial"):
+            accepted = type(self).__annotations__[name].__args__
+            require(
+                getattr(self, name) in accepted,
+                name,
+                getattr(self, name),
+                "one of " + ", ".join(accepted),
+            )
+        require(self.runs >= 1, "runs", self.runs, "at least 1")
+        require(0 <= self.seed < 2**63, "seed", self.seed, "between 0 and 2**63 - 1")
+        for name in _POSITIVE:
+            value = getattr(self, name)
+            require(_finite(value) and value > 0, name, value, "positive")
+        for name in _NON_NEGATIVE:
+            value = getattr(self, name)
+            require(_finite(value) and value >= 0, name, value, "zero or positive")
+        require(len(self.theta) >= 1, "theta", self.theta, "one positive factor or more")
+        for value in self.theta:
+            require(_finite(value) and value > 0, "theta", self.theta, "positive in every entry")
+        require(abs(self.latitude_deg) <= 90, "latitude_deg", self.latitude_deg, "within +-90")
+        if self.kf_theta is not None:
+            require(self.kf_theta > 0, "kf_theta", self.kf_theta, "positive")
+        require(0 < self.reset_threshold <= 1, "reset_threshold", self.reset_threshold, "in (0, 1]")
+        require(
+            self.reset_period_s >= self.filter_period_s,
+            "reset_period_s",
+            self.reset_period_s,
+            f"at least one filter period of {self.filter_period_s} s",
+        )
+        require(
+            0 < self.weight_floor < 1 / len(self.theta),
+            "weight_floor",
+            self.weight_floor,
+            f"positive and below 1 / {len(self.theta)}, the equal weight",
+        )
+        require(0 < self.switching < 1, "switching", self.switching, "between 0 and 1")
+        per_period = self.filter_period_s * self.ins_rate_hz
+        require(
+            per_period >= 1 - 1e-9 and abs(per_period - round(per_period)) < 1e-9 * per_period,
+            "filter_period_s",
+            self.filter_period_s,
+            f"a whole number of inertial samples of {1 / self.ins_rate_hz:g} s",
+        )
+        require(
+            self.duration_s >= self.filter_period_s,
+            "duration_s",
+            self.duration_s,
+            f"at least one filter period of {self.filter_period_s} s",
+        )
+
+    @property
+    def steps(self) -> int:
+        """Number of filter steps."""
+        return round(self.duration_s / self.filter_period_s)
+
+    @property
+    def samples_per_step(self) -> int:
+        """Inertial samples in a filter period."""
+        return round(self.filter_period_s * self.ins_rate_hz)
+
+    @property
+    def imu_step(self) -> float:
+        """Interval of the inertial samples [s]."""
+        return 1 / self.ins_rate_hz
+
+    @property
+    def single_theta(self) -> float:
+        """Factor on Q0 of the single Kalman filter."""
+        if self.kf_theta is not None:
+            return self.kf_theta
+        return 4.0 if self.scenario == "matched-noise" else 1.0
+
+
+_POSITIVE = (
+    "duration_s",
+    "ins_rate_hz",
+    "filter_period_s",
+    "star_noise_arcsec",
+    "p0_attitude_arcsec",
+    "p0_velocity",
+    "p0_position",
+    "p0_drift_deg_h",
+    "p0_bias_ug",
+    "step_theta",
+)
+_NON_NEGATIVE = ("gyro_noise_deg_h", "accel_noise_ug")
+
+
+def _finite(value: float) -> bool:
+    return abs(value) < float("inf")

@@ -1,0 +1,191 @@
+"""The methods of the study, and one run of all of them side by side.
+
+The single filter, the oracle and the four banks watch the same members: five models, the single
+filter's and the informed one. Each method is a weight rule over them, so the comparison costs seven
+filters rather than twenty-two.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.banks.mixture import BankParams, PanelState, moment_match, panel
+from jaxnav.estimation.banks.weights import (
+    WindowedReset,
+    bayes,
+    chain,
+    fixed,
+    floor,
+    markov,
+    windowed_reset,
+)
+from jaxnav.estimation.bounds import oracle
+from jaxnav.estimation.filters.kalman import kf
+from jaxnav.estimation.metrics import nees
+from jaxnav.estimation.montecarlo import RunOutput
+from jaxnav.estimation.run import run
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs, WeightRule
+from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsInput, SinsCnsParams, sins_cns
+from jaxnav.numerics.lie import so3_left_jacobian
+from jaxnav.studies.immae.config import ImmaeConfig
+from jaxnav.studies.immae.simulation import World, fly_linear, fly_sins, noise_of, prior_sigma
+
+RULES: dict[str, WeightRule] = {
+    "kf": fixed(),
+    "mmae": bayes(),
+    "immae": chain(bayes(), windowed_reset()),
+    "floor": chain(bayes(), floor()),
+    "markov": chain(markov(), bayes()),
+    "oracle": fixed(),
+}
+METHODS = tuple(RULES)
+BANKS = ("mmae", "immae", "floor", "markov")
+DIVERGED_SIGMAS = 5.0
+"""A method diverged in a run whose final attitude error exceeds this many star-tracker sigmas."""
+
+
+class Member(NamedTuple):
+    """Parameters of one member: those of its filter, and whether it is told the true noise."""
+
+    model: SinsCnsParams
+    initial: Gaussian
+    told: Array
+
+
+class Shared(NamedTuple):
+    """What all runs of a scenario share: the world and the parameters of the panel."""
+
+    world: World
+    params: BankParams
+
+
+class Row(NamedTuple):
+    """Statistics of one run; the leading axis of each is that of :data:`METHODS`.
+
+    Attributes:
+        mean_square: ``(methods, 3) [rad^2]`` of the errors of yaw, pitch, roll over the flight.
+        nees: ``(methods,)`` time average of the attitude's NEES (three degrees of freedom).
+        final_error: ``(methods,) [rad]`` norm of the attitude error at the end.
+        crossing: Step at which the MMAE first prefers the second model to the first in or after
+            the middle third; the number of steps if never.
+        returned: Whether the MMAE prefers the first model again at the end.
+    """
+
+    mean_square: Array
+    nees: Array
+    final_error: Array
+    crossing: Array
+    returned: Array
+
+
+def members_filter(period: float, imu_step: float) -> Filter:
+    """Return the Kalman filter of the error model, informed where its member is told."""
+
+    def informed(member: Member, u: SinsCnsInput) -> FilterParams:
+        scale = jnp.where(member.told, u.true_scale, member.model.noise_scale)
+        return FilterParams(member.model._replace(noise_scale=scale), member.initial)
+
+    return oracle(kf(sins_cns(period, imu_step)), informed)
+
+
+def panel_params(config: ImmaeConfig) -> BankParams:
+    """Return the parameters of the panel: models, single filter and informed filter."""
+    theta = jnp.array([*config.theta, config.single_theta, 1.0])
+    count = theta.shape[0]
+    noise, sigma = noise_of(config), prior_sigma(config)
+
+    def every(leaf: Array) -> Array:
+        return jnp.broadcast_to(leaf, (count, *leaf.shape))
+
+    members = Member(
+        model=jax.tree.map(every, noise)._replace(noise_scale=theta),
+        initial=Gaussian(jnp.zeros((count, 15)), every(jnp.diag(sigma**2))),
+        told=jnp.arange(count) == count - 1,
+    )
+    period = config.reset_period_s / config.filter_period_s
+    rules: dict[str, Any] = {
+        "kf": (),
+        "mmae": (),
+        "immae": ((), WindowedReset(jnp.array(period), jnp.array(config.reset_threshold))),
+        "floor": ((), jnp.array(config.weight_floor)),
+        "markov": (jnp.array(config.switching), ()),
+        "oracle": (),
+    }
+    models = len(config.theta)
+    bank = jnp.where(jnp.arange(count) < models, 0.0, -jnp.inf)
+    alone = {
+        "kf": jnp.where(jnp.arange(count) == models, 0.0, -jnp.inf),
+        "oracle": jnp.where(jnp.arange(count) == models + 1, 0.0, -jnp.inf),
+    }
+    return BankParams(members, rules, {name: alone.get(name, bank) for name in METHODS})
+
+
+def _record(state: PanelState, info: Any) -> tuple[Gaussian, Array]:
+    """Keep the attitude of every method ``(methods, 3)`` and the banks' log-weights."""
+    del info
+    phi = LAYOUT.phi
+    attitude = Gaussian(state.members.x[:, phi], state.members.P[:, phi, phi])
+    log_weights = jnp.stack([state.log_weights[name] for name in METHODS])
+    return jax.vmap(moment_match, in_axes=(0, None))(log_weights, attitude), log_weights
+
+
+@cache
+def run_one(chain_name: str, period: float, imu_step: float, models: int) -> Any:
+    """Return the run of all methods as a function of its key and :class:`Shared`.
+
+    Args:
+        chain_name: "sins" or "linear".
+        period: Filter period [s].
+        imu_step: Interval of the inertial samples [s].
+        models: Number of models in the banks.
+    """
+    simulate_run = {"sins": fly_sins, "linear": fly_linear}[chain_name]
+    comparison = panel(members_filter(period, imu_step), RULES)
+
+    def run_methods(key: Array, shared: Shared) -> RunOutput:
+        world, params = shared
+        flight = simulate_run(key, world, period, imu_step)
+        # One mask for all runs: the covariances may then be shared between them.
+        observations = Obs(flight.z, jnp.ones(world.dcm.shape[:2], bool))
+        trace = run(comparison, params, flight.inputs, observations, record=_record)
+        attitude, log_weights = trace.record
+        rotation = jax.vmap(_residual_rotation)(attitude.mean, flight.error[:, LAYOUT.phi])
+        error = jnp.einsum("kij,kmj->kmi", world.euler_map, rotation)[..., jnp.array([1, 0, 2])]
+        consistency = jax.vmap(jax.vmap(nees))(rotation, attitude.cov)
+        weights = jnp.exp(log_weights[:, :, :models])
+        row = _row(error, consistency, weights)
+        banks = jnp.array([METHODS.index(name) for name in BANKS])
+        sigma = jnp.sqrt(jnp.diagonal(attitude.cov, axis1=-2, axis2=-1))
+        curve = {"square": error**2, "nees": consistency, "weights": weights[:, banks]}
+        kept = {"error": error, "weights": weights[:, banks], "sigma": sigma}
+        return RunOutput(row, curve, kept)
+
+    return run_methods
+
+
+def _residual_rotation(estimated: Array, true: Array) -> Array:
+    """Return the rotation ``(methods, 3)`` left after correcting ``true`` by what was estimated.
+
+    ``log(exp(-a) exp(a + d)) = J_r(a) d`` to first order in the small ``d``; ``a`` is the large
+    misalignment of an open-loop solution.
+    """
+    jacobian = so3_left_jacobian(-true)
+    return jnp.einsum("ij,mj->mi", jacobian, true[None] - estimated)
+
+
+def _row(error: Array, consistency: Array, weights: Array) -> Row:
+    """Condense the histories ``(K, methods, ...)`` of one run."""
+    steps, models = weights.shape[0], weights.shape[2]
+    mmae = weights[:, METHODS.index("mmae")]
+    second = min(1, models - 1)
+    prefers = (mmae[:, second] > mmae[:, 0]) & (jnp.arange(steps) >= steps // 3)
+    return Row(
+        mean_square=jnp.mean(error**2, axis=0),
+        nees=jnp.mean(consistency, axis=0),
+        final_error=jnp.sqrt(jnp.sum(error[-1] ** 2, axis=-1)),
+        crossing=jnp.where(jnp.any(prefers), jnp.argmax(prefers), steps),
+        returned=mmae[-1, 0] >= mmae[-1, second],
+    )
