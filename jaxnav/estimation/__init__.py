@@ -2,3 +2,19 @@
 
 Knows nothing of navigation: a state-space model from any field is a :class:`~.types.Model`.
 """
+
+
+def catalogue() -> dict[str, dict[str, str]]:
+    """Return the filters, banks and weight rules with the first line of their documentation."""
+    from jaxnav.estimation.banks import mixture, weights
+    from jaxnav.estimation.filters import kalman, square_root
+
+    groups = {
+        "filters": (kalman.kf, square_root.square_root_kf),
+        "banks": (mixture.bank, mixture.mmae, mixture.immae, mixture.panel),
+        "weight rules": tuple(weights.RULES.values()),
+    }
+    return {
+        title: {entry.__name__: (entry.__doc__ or "").splitlines()[0] for entry in entries}
+        for title, entries in groups.items()
+    }

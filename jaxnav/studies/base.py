@@ -14,6 +14,22 @@ def require(condition: bool, name: str, value: object, accepted: str) -> None:
         raise ConfigError(f"{name} is {value}; it must be {accepted}")
 
 
+def require_x64() -> None:
+    """Raise :class:`ConfigError` if JAX is set to 32-bit floats.
+
+    Attitude covariances of arc seconds are near 1e-13 rad^2 beside positions in kilometres; the
+    studies are written for 64-bit floats.
+    """
+    import jax
+
+    require(
+        jax.config.jax_enable_x64,
+        "jax_enable_x64",
+        False,
+        "True before a study runs (jax.config.update('jax_enable_x64', True) or JAX_ENABLE_X64=1)",
+    )
+
+
 @dataclass(frozen=True)
 class Claim:
     """A claim of a paper, what was measured, and the verdict.

@@ -1,0 +1,5 @@
+"""``python -m jaxnav``: the command line."""
+
+from jaxnav.cli import entry
+
+entry()

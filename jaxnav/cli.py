@@ -1,0 +1,148 @@
+"""Command line: ``jaxnav list | run | doctor``.
+
+Imports of JAX and the studies wait until a command needs them, so that help is immediate.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxnav.datasets import DataError
+from jaxnav.studies import STUDIES
+from jaxnav.studies.base import ConfigError, StudyResult
+
+OK, BAD_INPUT, DIVERGED, INTERRUPTED = 0, 2, 3, 130
+
+USAGE = """\
+usage: jaxnav COMMAND [options]
+
+A differentiable filter bank for aided inertial navigation.
+
+commands:
+  list          studies with their scenarios, filters, weight rules
+  run STUDY     run a study; `jaxnav run STUDY --help` lists its parameters
+  doctor        versions, devices, 64-bit floats, compilation cache
+
+exit codes: 0 done, 2 bad input, 3 some runs diverged, 130 interrupted
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Args:
+        argv: Arguments without the program's name; the default is those of the process.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except (ConfigError, DataError) as error:
+        print(f"jaxnav: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("jaxnav: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE, end="")
+        return OK if arguments else BAD_INPUT
+    command, rest = arguments[0], arguments[1:]
+    commands: dict[str, Callable[[list[str]], int]] = {
+        "list": _list,
+        "run": _run,
+        "doctor": _doctor,
+    }
+    if command not in commands:
+        raise ConfigError(f"there is no command {command!r}; it must be {_either(commands)}")
+    return commands[command](rest)
+
+
+def _either(names: Any) -> str:
+    return "one of " + ", ".join(names)
+
+
+def _no_options(command: str, rest: list[str]) -> bool:
+    """Return whether help was asked for; refuse anything else."""
+    if rest and rest != ["--help"] and rest != ["-h"]:
+        raise ConfigError(f"`jaxnav {command}` takes no options, not {' '.join(rest)!r}")
+    return bool(rest)
+
+
+def _list(rest: list[str]) -> int:
+    if _no_options("list", rest):
+        print("usage: jaxnav list")
+        return OK
+    from jaxnav.report import print_catalogue
+
+    print_catalogue()
+    return OK
+
+
+def _doctor(rest: list[str]) -> int:
+    if _no_options("doctor", rest):
+        print("usage: jaxnav doctor")
+        return OK
+    configure_jax()
+    from jaxnav.report import print_doctor
+
+    print_doctor()
+    return OK
+
+
+def _run(rest: list[str]) -> int:
+    if not rest or rest[0] in ("-h", "--help"):
+        print(f"usage: jaxnav run STUDY [options]; STUDY is {_either(STUDIES)}")
+        return OK if rest else BAD_INPUT
+    name, options = rest[0], rest[1:]
+    if name not in STUDIES:
+        raise ConfigError(f"there is no study {name!r}; it must be {_either(STUDIES)}")
+    study = STUDIES[name]
+    from jaxnav.options import parse_run
+
+    parsed = parse_run(name, study.load("config"), options)
+    if parsed is None:
+        return OK
+    configure_jax()
+    from jaxnav.report import Progress, print_json, print_result
+    from jaxnav.results import claim_directory, write
+
+    directory = claim_directory(parsed.out)
+    with Progress(quiet=parsed.json) as progress:
+        results: list[StudyResult] = study.load("entry")(parsed.config, progress)
+    draw = study.load("figures")
+    for result in results:
+        target = directory
+        if len(results) > 1:
+            target = claim_directory(directory / result.scenario)
+        write(result, target)
+        figures = draw(result, target)
+        if not parsed.json:
+            print_result(result, target, figures)
+    if parsed.json:
+        print_json(results)
+    return DIVERGED if any(result.diverged for result in results) else OK
+
+
+def configure_jax() -> None:
+    """Set JAX up for a process of our own: 64-bit floats, one device per core, a compile cache.
+
+    An explicit ``JAX_ENABLE_X64=0`` is left alone, so that a study can refuse it.
+    """
+    import jax
+
+    if "JAX_ENABLE_X64" not in os.environ:
+        jax.config.update("jax_enable_x64", True)
+    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(home / "jaxnav" / "xla"))
+
+
+def entry() -> None:
+    """Console script: exit with the code of :func:`main`."""
+    sys.exit(main())

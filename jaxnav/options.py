@@ -1,0 +1,79 @@
+"""Options of a study on the command line, made from its configuration class by tyro."""
+
+import contextlib
+import io
+import re
+from dataclasses import field, make_dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+
+from jaxnav.studies.base import ConfigError
+
+
+class RunOptions(NamedTuple):
+    """What ``jaxnav run STUDY`` was asked for."""
+
+    config: Any
+    out: Path
+    json: bool
+
+
+def parse_run(study: str, config: type, arguments: list[str]) -> RunOptions | None:
+    """Parse the options of ``jaxnav run STUDY``.
+
+    Args:
+        study: Name of the study.
+        config: Its configuration class: every field is a flag.
+        arguments: The arguments after the study's name.
+
+    Returns:
+        The options, or ``None`` if help was asked for and printed.
+
+    Raises:
+        ConfigError: With one sentence on what was wrong and what is accepted.
+    """
+    options = make_dataclass(
+        "Options",
+        [
+            ("config", tyro.conf.OmitArgPrefixes[config], field(default_factory=config)),
+            ("out", Path, field(default=Path("results") / study)),
+            ("json", bool, field(default=False)),
+        ],
+        frozen=True,
+    )
+    options.__doc__ = (
+        f"{(config.__doc__ or study).splitlines()[0]}\n\n"
+        "Attributes:\n"
+        "    config: Parameters of the study.\n"
+        "    out: Directory for summary.json, arrays.npz and the figures.\n"
+        "    json: Print the summaries as JSON instead of tables.\n"
+    )
+    program = f"jaxnav run {study}"
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            parsed: Any = tyro.cli(options, prog=program, args=arguments)
+    except SystemExit as stop:
+        if not stop.code:
+            print(said.getvalue(), end="")
+            return None
+        raise ConfigError(_sentence(said.getvalue(), program)) from None
+    return RunOptions(parsed.config, parsed.out, parsed.json)
+
+
+def _sentence(box: str, program: str) -> str:
+    """Return the message inside tyro's error box as one sentence."""
+    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()]
+    body = [line for line in lines if line][1:]
+    end = next((i for i, line in enumerate(body) if set(line) == {"─"}), len(body))
+    text = " ".join(body[:end]).rstrip(".")
+    flag = re.match(r"Error parsing (--[\w-]+): .*?'([^']*)'$", text)
+    if flag:
+        kind = re.search(rf"{flag[1]} ([^ ]+)", " ".join(body[end:]))
+        return f"{flag[1]} is {flag[2]!r}; it must be of type {kind[1] if kind else 'number'}"
+    text = re.sub(r"^Error parsing \w+: ", "", text)
+    if text.startswith("Unrecognized options"):
+        return f"{text[0].lower()}{text[1:]}; `{program} --help` lists what is accepted"
+    return text

@@ -1,0 +1,47 @@
+"""Figures: one style, headless, and saved at 150 dpi."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+DPI = 150
+STYLE = {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "lines.linewidth": 1.0,
+}
+COLOURS = {
+    "kf": "tab:red",
+    "mmae": "tab:orange",
+    "immae": "tab:blue",
+    "floor": "tab:green",
+    "markov": "tab:purple",
+    "oracle": "black",
+}
+"""Colour of each method, the same in all figures."""
+
+
+@contextmanager
+def figure(path: Path, size: tuple[float, float], **layout: Any) -> Iterator[Figure]:
+    """Give a figure in the project's style and save it to ``path`` at the end."""
+    with mpl.rc_context(STYLE):
+        made = Figure(figsize=size, layout="constrained", **layout)
+        yield made
+        made.savefig(path, dpi=DPI)
+
+
+def plot_weights(axes: Any, time: Any, weights: Any, labels: Sequence[str]) -> None:
+    """Plot the weights ``(T, M)`` of a bank's models over time [s]."""
+    for j, label in enumerate(labels):
+        axes.plot(time, weights[:, j], label=label)
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_ylabel("weight")
+    axes.set_xlabel("time [s]")

@@ -1,0 +1,181 @@
+"""What a person reads in the terminal: tables, progress, and the state of the installation."""
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import rich.progress
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from jaxnav.results import provenance, summary
+from jaxnav.studies import STUDIES
+from jaxnav.studies.base import Claim, StudyResult
+
+
+class Progress:
+    """Progress of the scenarios with the time left, on standard error."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        """Make the display; ``quiet`` shows nothing."""
+        self._tasks: dict[str, rich.progress.TaskID] = {}
+        self._display = rich.progress.Progress(
+            rich.progress.TextColumn("{task.description}"),
+            rich.progress.BarColumn(),
+            rich.progress.MofNCompleteColumn(),
+            rich.progress.TextColumn("runs, left"),
+            rich.progress.TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+            disable=quiet,
+        )
+
+    def __enter__(self) -> "Progress":
+        """Start the display."""
+        self._display.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop the display."""
+        self._display.stop()
+
+    def __call__(self, label: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` runs are done."""
+        if label not in self._tasks:
+            self._tasks[label] = self._display.add_task(label, total=total)
+        self._display.update(self._tasks[label], completed=done)
+
+
+def print_result(result: StudyResult, directory: Path, figures: list[Path]) -> None:
+    """Print the table of methods, the claims with their verdicts, and where the files are."""
+    console = Console()
+    console.print(_method_table(result))
+    if result.claims:
+        console.print(_claim_table(result.claims))
+    for note in result.notes:
+        console.print(escape(note))
+    if result.diverged:
+        console.print(f"[red]{result.diverged} of {result.runs} runs diverged")
+    names = ", ".join(path.name for path in figures)
+    console.print(f"Written to {directory}: summary.json, arrays.npz, {names}\n", soft_wrap=True)
+
+
+def print_json(results: list[StudyResult]) -> None:
+    """Print the summaries as JSON: an object for one scenario, a list for several."""
+    documents = [summary(result) for result in results]
+    print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=2))
+
+
+def _method_table(result: StudyResult) -> Table:
+    """One row a method; a column for each measure that any method has."""
+    table = Table(
+        title=f"{result.study}, {result.scenario}: {result.runs} runs, seed {result.seed}"
+    )
+    table.add_column("method")
+    columns: dict[str, str] = {}
+    for measures in result.methods.values():
+        for name, measure in measures.get("rmse", {}).items():
+            columns[name] = measure["unit"]
+    scalars = [
+        name
+        for name in ("log_likelihood", "anees", "diverged")
+        if any(name in measures for measures in result.methods.values())
+    ]
+    for name, unit in columns.items():
+        table.add_column(f"RMSE {name} [{unit}]", justify="right")
+    for name in scalars:
+        table.add_column(name.replace("_", " "), justify="right")
+    for method, measures in result.methods.items():
+        errors = [_with_error(measures.get("rmse", {}).get(name)) for name in columns]
+        table.add_row(method, *errors, *(_number(measures.get(name)) for name in scalars))
+    return table
+
+
+def _with_error(measure: dict[str, Any] | None) -> str:
+    if measure is None:
+        return ""
+    value, se = measure["value"], measure.get("se")
+    if se is None or se != se:
+        return f"{value:.4f}"
+    return f"{value:.4f} ± {se:.4f}"
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return str(value) if isinstance(value, int) else f"{value:.3f}"
+
+
+def _claim_table(claims: list[Claim]) -> Table:
+    table = Table(title="claims")
+    for heading in ("claim", "published", "measured", "95 % interval", "verdict"):
+        justify = "left" if heading in ("claim", "verdict") else "right"
+        table.add_column(heading, justify=justify)
+    colours = {"reproduced": "green", "not reproduced": "red"}
+    for claim in claims:
+        interval = "" if claim.ci95 is None else f"{claim.ci95[0]:.4g} to {claim.ci95[1]:.4g}"
+        colour = colours.get(claim.verdict, "yellow")
+        table.add_row(
+            escape(claim.text),
+            "" if claim.published is None else f"{claim.published:.4g}",
+            "" if claim.measured is None else f"{claim.measured:.4g}",
+            interval,
+            f"[{colour}]{claim.verdict}",
+        )
+    return table
+
+
+def print_catalogue() -> None:
+    """Print the studies, filters, weight rules and data formats."""
+    from jaxnav.estimation import catalogue
+
+    console = Console()
+    table = Table(title="studies")
+    table.add_column("study")
+    table.add_column("scenario")
+    table.add_column("what it is")
+    for name, study in STUDIES.items():
+        table.add_row(name, "", study.summary)
+        for scenario, text in study.load("scenarios").items():
+            table.add_row("", scenario, escape(text))
+    console.print(table)
+    for title, entries in catalogue().items():
+        listing = Table(title=title)
+        listing.add_column("name")
+        listing.add_column("what it is")
+        for name, text in entries.items():
+            listing.add_row(name, escape(text))
+        console.print(listing)
+    console.print("data formats: RTKLIB .pos (gnss-track --log PATH)")
+
+
+def print_doctor() -> None:
+    """Print versions, devices, precision and the compilation cache."""
+    import jax
+
+    console = Console()
+    table = Table(title="jaxnav doctor", show_header=False)
+    for name, value in provenance().items():
+        table.add_row(name, ", ".join(value) if isinstance(value, list) else str(value))
+    table.add_row("compilation cache", str(jax.config.jax_compilation_cache_dir or "off"))
+    table.add_row("peers for benchmarks", _peers())
+    console.print(table)
+
+
+def _peers() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = []
+    for name in ("cuthbert", "dynamax", "filterpy", "smcx"):
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join(found) or "none installed (jaxnav[peers])"

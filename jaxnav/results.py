@@ -1,0 +1,131 @@
+"""Results on disk: ``summary.json`` (schema 1), ``arrays.npz``, and the view as xarray."""
+
+import json
+import math
+import os
+import platform
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxnav.studies.base import ConfigError, StudyResult
+
+SCHEMA = 1
+
+
+def summary(result: StudyResult) -> dict[str, Any]:
+    """Return the contents of ``summary.json``: numbers that are not finite become ``null``."""
+    return _finite_or_null(
+        {
+            "schema": SCHEMA,
+            "study": result.study,
+            "scenario": result.scenario,
+            "runs": result.runs,
+            "seed": result.seed,
+            "config": result.config,
+            "provenance": provenance(),
+            "methods": result.methods,
+            "published": result.published,
+            "claims": [vars(claim) for claim in result.claims],
+            "notes": result.notes,
+        }
+    )
+
+
+def provenance() -> dict[str, Any]:
+    """Return the versions and the machine a result comes from."""
+    import jax
+
+    packages = ("jaxnav", "jax", "jaxlib", "numpy", "scipy", "optax")
+    return {
+        **{name: version(name) for name in packages},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "devices": [str(device) for device in jax.local_devices()],
+        "x64": bool(jax.config.jax_enable_x64),
+    }
+
+
+def _finite_or_null(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _finite_or_null(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite_or_null(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def claim_directory(directory: Path) -> Path:
+    """Create the output directory and prove that it can be written, before any work is done.
+
+    Raises:
+        ConfigError: If it cannot be created or written.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise ConfigError(
+            f"the output directory {directory} is not usable ({reason}); "
+            "it must be a directory that can be written"
+        ) from error
+    return directory
+
+
+def write(result: StudyResult, directory: Path) -> Path:
+    """Write ``summary.json`` and ``arrays.npz``; each file is complete or not there.
+
+    Returns:
+        The path of ``summary.json``.
+    """
+    text = json.dumps(summary(result), indent=2, allow_nan=False)
+    _replace(directory / "arrays.npz", lambda path: _save_arrays(path, result.arrays))
+    return _replace(
+        directory / "summary.json", lambda path: path.write_text(text + "\n", encoding="utf-8")
+    )
+
+
+def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def _replace(path: Path, save: Any) -> Path:
+    """Write beside the target and move over it, so that a reader never sees half a file."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        save(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def to_xarray(result: StudyResult) -> Any:
+    """Return the arrays of a result as an ``xarray.Dataset`` with named axes.
+
+    Needs the extra ``jaxnav[xarray]``.
+
+    Raises:
+        ModuleNotFoundError: If xarray is not installed.
+    """
+    try:
+        import xarray
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "xarray is not installed; install jaxnav[xarray] for to_xarray"
+        ) from error
+    named = {name: (dims, result.arrays[name]) for name, dims in result.dims.items()}
+    axes = {axis for dims in result.dims.values() for axis in dims}
+    coordinates = {axis: result.arrays[axis] for axis in axes if axis in result.arrays}
+    variables = {name: entry for name, entry in named.items() if name not in coordinates}
+    attributes = {"study": result.study, "scenario": result.scenario, "runs": result.runs}
+    return xarray.Dataset(variables, coords=coordinates, attrs=attributes)

@@ -1,0 +1,48 @@
+"""Published systems as studies: a configuration, a simulation, methods, and claims with verdicts.
+
+The registry is free of JAX, so that listing studies and parsing their options is immediate.
+"""
+
+from importlib import import_module
+from typing import Any, NamedTuple
+
+
+class Study(NamedTuple):
+    """A study by name, its parts loaded on demand.
+
+    Attributes:
+        summary: One line.
+        config: ``module:class`` of its configuration, free of JAX.
+        entry: ``module:function`` with ``(config, progress) -> list[StudyResult]``.
+        figures: ``module:function`` with ``(result, directory) -> list[Path]``.
+        scenarios: ``module:mapping`` from scenario to one line, free of JAX.
+    """
+
+    summary: str
+    config: str
+    entry: str
+    figures: str
+    scenarios: str
+
+    def load(self, part: str) -> Any:
+        """Return the object that one of the fields names."""
+        module, name = getattr(self, part).split(":")
+        return getattr(import_module(module), name)
+
+
+STUDIES = {
+    "immae": Study(
+        summary="SINS/CNS attitude with unknown process noise: KF, MMAE, IMMAE (Si, Wang, Niu)",
+        config="jaxnav.studies.immae.config:ImmaeConfig",
+        entry="jaxnav.studies.immae.study:run_study",
+        figures="jaxnav.studies.immae.figures:draw",
+        scenarios="jaxnav.studies.immae.config:SCENARIOS",
+    ),
+    "gnss-track": Study(
+        summary="a recorded GNSS track through the same bank, judged by predictive likelihood",
+        config="jaxnav.studies.gnss_track.config:GnssTrackConfig",
+        entry="jaxnav.studies.gnss_track.study:run_study",
+        figures="jaxnav.studies.gnss_track.figures:draw",
+        scenarios="jaxnav.studies.gnss_track.config:SCENARIOS",
+    ),
+}

@@ -1,0 +1,126 @@
+"""The study as a whole: scenarios, Monte Carlo, measures."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxnav.estimation.metrics import rmse, trmse
+from jaxnav.estimation.montecarlo import Campaign, monte_carlo
+from jaxnav.studies.base import StudyResult, plain, require_x64
+from jaxnav.studies.immae.claims import PUBLISHED, assess
+from jaxnav.studies.immae.config import SCENARIOS, ImmaeConfig
+from jaxnav.studies.immae.methods import (
+    BANKS,
+    DIVERGED_SIGMAS,
+    METHODS,
+    Shared,
+    panel_params,
+    run_one,
+)
+from jaxnav.studies.immae.simulation import build_world
+from jaxnav.units import ARCSEC
+
+AXES = ("yaw", "pitch", "roll")
+
+
+def run_study(
+    config: ImmaeConfig, progress: Callable[[str, int, int], None] | None = None
+) -> list[StudyResult]:
+    """Run one scenario, or all of them.
+
+    Args:
+        config: The configuration.
+        progress: Called with (scenario, runs done, runs).
+
+    Returns:
+        One result per scenario.
+
+    Raises:
+        ConfigError: If 64-bit floats are off.
+    """
+    require_x64()
+    names = tuple(SCENARIOS) if config.scenario == "all" else (config.scenario,)
+    return [_run_scenario(replace(config, scenario=name), progress) for name in names]
+
+
+def _run_scenario(
+    config: ImmaeConfig, progress: Callable[[str, int, int], None] | None
+) -> StudyResult:
+    campaign = run_campaign(
+        config,
+        keep=1,
+        progress=None
+        if progress is None
+        else lambda done, total: progress(config.scenario, done, total),
+    )
+    return StudyResult(
+        study="immae",
+        scenario=config.scenario,
+        runs=config.runs,
+        seed=config.seed,
+        config=plain(config),
+        methods=_measures(config, campaign),
+        published=PUBLISHED.get(config.scenario, {}),
+        claims=assess(config, campaign),
+        arrays=_arrays(config, campaign),
+        dims={
+            "time": ("time",),
+            "trmse": ("time", "method", "axis"),
+            "mean_weights": ("time", "bank", "model"),
+            "run_0_error": ("time", "method", "axis"),
+            "run_0_sigma": ("time", "method", "component"),
+            "run_0_weights": ("time", "bank", "model"),
+            "mean_square": ("run", "method", "axis"),
+            "nees": ("run", "method"),
+        },
+    )
+
+
+def run_campaign(config: ImmaeConfig, **options: Any) -> Campaign:
+    """Run the Monte Carlo of one scenario; options are those of ``monte_carlo``."""
+    one = run_one(config.chain, config.filter_period_s, config.imu_step, len(config.theta))
+    shared = Shared(build_world(config), panel_params(config))
+    return monte_carlo(one, jax.random.key(config.seed), config.runs, shared, **options)
+
+
+def _measures(config: ImmaeConfig, campaign: Campaign) -> dict[str, dict[str, Any]]:
+    rows = campaign.rows
+    limit = DIVERGED_SIGMAS * config.star_noise_arcsec * ARCSEC
+    measures: dict[str, dict[str, Any]] = {}
+    for i, name in enumerate(METHODS):
+        lost = ~np.all(np.isfinite(rows.mean_square[:, i]), axis=-1)
+        lost |= ~(rows.final_error[:, i] <= limit)
+        axes = {
+            axis: {**rmse(rows.mean_square[:, i, j] / ARCSEC**2)._asdict(), "unit": "arcsec"}
+            for j, axis in enumerate(AXES)
+        }
+        mean = rmse(rows.mean_square[:, i].mean(axis=-1) / ARCSEC**2)
+        measures[name] = {
+            "rmse": axes,
+            "rmse_all": {**mean._asdict(), "unit": "arcsec"},
+            "anees": float(rows.nees[:, i].mean()),
+            "anees_dof": 3,
+            "diverged": int(lost.sum()),
+        }
+    return measures
+
+
+def _arrays(config: ImmaeConfig, campaign: Campaign) -> dict[str, Any]:
+    curve, first = campaign.mean_curve, jax.tree.map(lambda leaf: leaf[0], campaign.traces)
+    return {
+        "time": config.filter_period_s * np.arange(1, config.steps + 1),
+        "trmse": trmse(curve["square"]) / ARCSEC,
+        "mean_weights": curve["weights"],
+        "run_0_error": first["error"] / ARCSEC,
+        "run_0_sigma": first["sigma"] / ARCSEC,
+        "run_0_weights": first["weights"],
+        "mean_square": campaign.rows.mean_square / ARCSEC**2,
+        "nees": campaign.rows.nees,
+        "method": np.array(METHODS),
+        "axis": np.array(AXES),
+        "bank": np.array(BANKS),
+        "model": np.array(config.theta),
+    }
