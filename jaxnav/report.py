@@ -89,7 +89,7 @@ def _method_table(result: StudyResult) -> Table:
         if any(name in measures for measures in result.methods.values())
     ]
     for name, unit in columns.items():
-        table.add_column(f"RMSE {name} [{unit}]", justify="right")
+        table.add_column(escape(f"RMSE {name} [{unit}]"), justify="right")
     for name in scalars:
         table.add_column(name.replace("_", " "), justify="right")
     for method, measures in result.methods.items():

@@ -1,7 +1,7 @@
 """What every study is: scenarios of a configuration, a result, claims and their verdicts."""
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, get_args
 
 
 class ConfigError(ValueError):
@@ -12,6 +12,24 @@ def require(condition: bool, name: str, value: object, accepted: str) -> None:
     """Raise :class:`ConfigError` with one sentence unless the condition holds."""
     if not condition:
         raise ConfigError(f"{name} is {value}; it must be {accepted}")
+
+
+def require_choice(config: Any, *names: str) -> None:
+    """Require that fields annotated as literals hold one of them."""
+    for name in names:
+        accepted = get_args(type(config).__annotations__[name])
+        value = getattr(config, name)
+        require(value in accepted, name, value, "one of " + ", ".join(accepted))
+
+
+def require_positive(config: Any, *names: str) -> None:
+    """Require that fields, or all entries of those that are tuples, are positive and finite."""
+    for name in names:
+        value = getattr(config, name)
+        entries = value if isinstance(value, tuple) else (value,)
+        accepted = "positive in one entry or more" if isinstance(value, tuple) else "positive"
+        good = len(entries) > 0 and all(0 < entry < float("inf") for entry in entries)
+        require(good, name, value, accepted)
 
 
 def require_x64() -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxnav.studies.base import require
+from jaxnav.studies.base import require, require_choice, require_positive
 
 SCENARIOS = {
     "matched-noise": "simulation 1: true noise Q0 throughout, single Kalman filter at 4 Q0",
@@ -85,25 +85,13 @@ class ImmaeConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        for name in ("scenario", "chain", "initial"):
-            accepted = type(self).__annotations__[name].__args__
-            require(
-                getattr(self, name) in accepted,
-                name,
-                getattr(self, name),
-                "one of " + ", ".join(accepted),
-            )
+        require_choice(self, "scenario", "chain", "initial")
         require(self.runs >= 1, "runs", self.runs, "at least 1")
         require(0 <= self.seed < 2**63, "seed", self.seed, "between 0 and 2**63 - 1")
-        for name in _POSITIVE:
+        require_positive(self, *_POSITIVE)
+        for name in ("gyro_noise_deg_h", "accel_noise_ug"):
             value = getattr(self, name)
-            require(_finite(value) and value > 0, name, value, "positive")
-        for name in _NON_NEGATIVE:
-            value = getattr(self, name)
-            require(_finite(value) and value >= 0, name, value, "zero or positive")
-        require(len(self.theta) >= 1, "theta", self.theta, "one positive factor or more")
-        for value in self.theta:
-            require(_finite(value) and value > 0, "theta", self.theta, "positive in every entry")
+            require(0 <= value < float("inf"), name, value, "zero or positive")
         require(abs(self.latitude_deg) <= 90, "latitude_deg", self.latitude_deg, "within +-90")
         if self.kf_theta is not None:
             require(self.kf_theta > 0, "kf_theta", self.kf_theta, "positive")
@@ -159,6 +147,7 @@ class ImmaeConfig:
 
 
 _POSITIVE = (
+    "theta",
     "duration_s",
     "ins_rate_hz",
     "filter_period_s",
@@ -170,8 +159,3 @@ _POSITIVE = (
     "p0_bias_ug",
     "step_theta",
 )
-_NON_NEGATIVE = ("gyro_noise_deg_h", "accel_noise_ug")
-
-
-def _finite(value: float) -> bool:
-    return abs(value) < float("inf")

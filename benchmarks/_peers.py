@@ -1,0 +1,245 @@
+"""Other ways to run the bank's members: JAX libraries, filterpy, batched NumPy and plain C.
+
+Each takes the problem as matrices and gives the members' attitude and log-likelihood; the weights of
+the bank are no part of their work.
+"""
+
+import ctypes
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, PartitionSpec
+
+from benchmarks._problem import THETA, Dense
+
+Series = Callable[[Array, Array, Array], tuple[Array, Array]]
+"""``(F (T, 15, 15), G (T, 15, 6), z (T, 3)) -> (attitude (T, 3), log-likelihood)`` of one model."""
+
+
+class Missing(Exception):
+    """A contestant that cannot run here; the message says why."""
+
+
+class Contestant(NamedTuple):
+    """A way to run the members.
+
+    Attributes:
+        name: For the table.
+        lane_steps: Filter steps over all runs and models in one timed call, at most: what is slow,
+            or holds a matrix per run, model and step, is timed on a part of the flight.
+        prepare: ``(problem) -> calls``, by the way they spread the work; each gives attitude
+            ``(runs, M, T, 3)`` and log-likelihood ``(runs, M)``. Raises :class:`Missing`.
+        jax: Whether it is a JAX library.
+        runs: Largest number of runs it is asked for; it has no batch if 1.
+    """
+
+    name: str
+    lane_steps: int
+    prepare: Callable[[Dense], dict[str, Callable[[], tuple[Any, Any]]]]
+    jax: bool = False
+    runs: int = 2**31
+
+
+def first_prediction(F: Array, Q: Array, P0: Array) -> Array:
+    """Return the covariance before the first update, for libraries whose prior is that one."""
+    return F[0] @ P0 @ F[0].T + Q[0]
+
+
+def dynamax_series(H: Array, R: Array, P0: Array) -> Series:
+    """Return dynamax's linear-Gaussian filter."""
+    try:
+        from dynamax.linear_gaussian_ssm.inference import lgssm_filter, make_lgssm_params
+    except ImportError as error:
+        raise Missing("dynamax is not installed") from error
+
+    def filter_one(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
+        Q = G @ jnp.swapaxes(G, -1, -2)
+        P = first_prediction(F, Q, P0)
+        # The arguments' shape hints are for constant matrices; the time axis is documented.
+        out = lgssm_filter(make_lgssm_params(jnp.zeros(15), P, F, Q, H, R), z)
+        means: Any = out.filtered_means
+        return means[:, :3], jnp.asarray(out.marginal_loglik)
+
+    return filter_one
+
+
+def smcx_series(H: Array, R: Array, P0: Array) -> Series:
+    """Return smcx's Kalman filter."""
+    try:
+        from smcx import kalman_filter
+    except ImportError as error:
+        raise Missing("smcx is not installed") from error
+
+    def filter_one(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
+        Q = G @ jnp.swapaxes(G, -1, -2)
+        P = first_prediction(F, Q, P0)
+        out = kalman_filter(jnp.zeros(15), P, F[1:], Q[1:], H, R, z)
+        return out.filtered_means[:, :3], out.marginal_loglik
+
+    return filter_one
+
+
+def cuthbert_series(H: Array, R: Array, P0: Array) -> Series:
+    """Return cuthbert's square-root Kalman filter, in sequential form."""
+    try:
+        from cuthbert import filter as run_filter
+        from cuthbert.gaussian import kalman
+    except ImportError as error:
+        raise Missing("cuthbert is not installed") from error
+
+    def filter_one(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
+        root = jnp.concatenate([G, jnp.zeros((len(G), 15, 9))], axis=-1)
+        dynamics = lambda u: (u[0], jnp.zeros(15), u[1])  # noqa: E731
+        observation = lambda u: (H, jnp.zeros(3), jnp.sqrt(R), u[2])  # noqa: E731
+        built = kalman.build_filter(jnp.zeros(15), jnp.sqrt(P0), dynamics, observation)
+        states = run_filter(built, (F, root, z), built.init_prepare())
+        return states.mean[1:, :3], states.log_normalizing_constant[-1]
+
+    return filter_one
+
+
+def jax_calls(series: Callable[[Array, Array, Array], Series]) -> Callable[[Dense], dict]:
+    """Return how a user runs a JAX filter over models and runs: ``vmap`` and ``jit``.
+
+    Once as it is, with XLA free to use both cores, and once with the runs split over the devices.
+    """
+
+    def prepare(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
+        filter_one = series(*(jnp.asarray(m) for m in (problem.H, problem.R, problem.P0)))
+        axis = 0 if problem.own else None
+
+        def models(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
+            each = lambda scale: filter_one(F, jnp.sqrt(scale) * G, z)  # noqa: E731
+            return jax.vmap(each)(jnp.array(THETA))
+
+        batch = jax.vmap(models, in_axes=(axis, axis, 0))
+        mesh = Mesh(np.array(jax.local_devices()), ("runs",))
+        spread, whole = PartitionSpec("runs"), PartitionSpec()
+        matrices = spread if problem.own else whole
+        split = jax.shard_map(
+            batch,
+            mesh=mesh,
+            in_specs=(matrices, matrices, spread),
+            out_specs=spread,
+            check_vma=False,
+        )
+        values = tuple(jnp.asarray(m) for m in (problem.F, problem.G, problem.z))
+        calls = {"vmap": jax.jit(batch)}
+        if len(problem.z) % mesh.size == 0:
+            calls["devices"] = jax.jit(split)
+        return {name: lambda call=call: call(*values) for name, call in calls.items()}
+
+    return prepare
+
+
+def prepare_filterpy(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
+    """Return filterpy's loop over one run and one model after the other."""
+    try:
+        from filterpy.kalman import KalmanFilter
+    except ImportError as error:
+        raise Missing("filterpy is not installed") from error
+    F = problem.F if problem.own else problem.F[None]
+    Q = problem.Q if problem.own else problem.Q[None]
+
+    def loop(run: int, scale: float) -> tuple[np.ndarray, float]:
+        kf = KalmanFilter(dim_x=15, dim_z=3)
+        kf.P, kf.H, kf.R = problem.P0.copy(), problem.H, problem.R
+        attitude, total, own = [], 0.0, run if problem.own else 0
+        for k, z in enumerate(problem.z[run]):
+            kf.predict(F=F[own, k], Q=scale * Q[own, k])
+            kf.update(z)
+            total += kf.log_likelihood
+            attitude.append(kf.x[:3, 0].copy())
+        return np.array(attitude), total
+
+    def call() -> tuple[np.ndarray, np.ndarray]:
+        done = [[loop(run, scale) for scale in THETA] for run in range(len(problem.z))]
+        return np.array([[a for a, _ in row] for row in done]), np.array(
+            [[t for _, t in row] for row in done]
+        )
+
+    return {"loop": call}
+
+
+def prepare_numpy(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
+    """Return batched NumPy: ``matmul`` over runs and models; runs that can share, share."""
+    F, Q, H, R = problem.F, problem.Q, problem.H, problem.R
+    batch = len(problem.z) if problem.own else 1
+    Ft, Qt = (np.moveaxis(m, -3, 0).reshape(-1, batch, 1, 15, 15) for m in (F, Q))
+    theta = np.array(THETA)[:, None, None]
+
+    def call() -> tuple[np.ndarray, np.ndarray]:
+        x = np.zeros((len(problem.z), len(THETA), 15, 1))
+        P = np.broadcast_to(problem.P0, (batch, len(THETA), 15, 15))
+        attitude, total = [], np.zeros(x.shape[:2])
+        for k in range(problem.z.shape[1]):
+            x, P = Ft[k] @ x, Ft[k] @ P @ Ft[k].swapaxes(-1, -2) + theta * Qt[k]
+            nu = problem.z[:, None, k, :, None] - H @ x
+            S = H @ P @ H.T + R
+            inverse = np.linalg.inv(S)
+            K = P @ H.T @ inverse
+            A = np.eye(15) - K @ H
+            x, P = x + K @ nu, A @ P @ A.swapaxes(-1, -2) + K @ R @ K.swapaxes(-1, -2)
+            nis = (nu.swapaxes(-1, -2) @ inverse @ nu)[..., 0, 0]
+            total = total - 0.5 * (nis + np.log(np.linalg.det(2 * np.pi * S)))
+            attitude.append(x[..., :3, 0])
+        return np.moveaxis(np.array(attitude), 0, 2), total
+
+    return {"matmul": call}
+
+
+def prepare_c(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
+    """Return the C loop of ``kalman.c``, compiled for this machine, on one core."""
+    function = _compiled().kalman_bank
+    runs, steps, models = *problem.z.shape[:2], len(THETA)
+    matrices = [problem.F, problem.Q, np.array(THETA), problem.H, problem.R, problem.P0, problem.z]
+    given = [np.ascontiguousarray(m) for m in matrices]
+    x, total = np.empty((runs * models, 15)), np.empty((runs, models))
+    attitude = np.empty((runs, models, steps, 3))
+    if not problem.own:
+        attitude, total = (m.reshape(models, runs, *m.shape[2:]) for m in (attitude, total))
+    pointers = [ctypes.c_void_p(m.ctypes.data) for m in (*given, x, attitude, total)]
+    sizes = [ctypes.c_long(n) for n in (int(problem.own), runs, models, steps)]
+
+    def call(keep: Any = given) -> tuple[np.ndarray, np.ndarray]:
+        del keep  # the pointers do not own what they point to
+        function(*sizes, *pointers)
+        return (attitude, total) if problem.own else (attitude.swapaxes(0, 1), total.T)
+
+    return {"one core": call}
+
+
+def _compiled() -> ctypes.CDLL:
+    compiler = shutil.which(os.environ.get("CC", "cc"))
+    if compiler is None:
+        raise Missing("no C compiler was found")
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "kalman.so"
+        source = Path(__file__).with_name("kalman.c")
+        flags = ["-O3", "-march=native", "-shared", "-fPIC"]
+        try:
+            subprocess.run(
+                [compiler, *flags, source, "-o", library, "-lm"], check=True, capture_output=True
+            )
+        except subprocess.CalledProcessError as error:
+            raise Missing(f"{compiler} failed: {error.stderr.decode().strip()}") from error
+        return ctypes.CDLL(str(library))
+
+
+CONTESTANTS = (
+    Contestant("dynamax", 200_000, jax_calls(dynamax_series), jax=True),
+    Contestant("smcx", 200_000, jax_calls(smcx_series), jax=True),
+    Contestant("cuthbert", 20_000, jax_calls(cuthbert_series), jax=True),
+    Contestant("NumPy, batched", 50_000, prepare_numpy),
+    Contestant("filterpy, one run", 2_500, prepare_filterpy, runs=1),
+    Contestant("C, dense, one core", 200_000, prepare_c),
+)

@@ -1,0 +1,66 @@
+"""Configuration of the study ``gnss-track``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from jaxnav.studies.base import require, require_choice, require_positive
+
+SCENARIOS = {
+    "full-rate": "every fix of the log",
+    "thinned": "one fix per `thin_period_s`",
+}
+
+
+@dataclass(frozen=True)
+class GnssTrackConfig:
+    """A recorded GNSS track through a bank of constant-velocity filters.
+
+    Attributes:
+        log: RTKLIB solution file (.pos) with latitude, longitude, height; with velocity if the
+            estimate is to be scored against it.
+        scenario: Rate at which the fixes are used; "all" runs both.
+        thin_period_s: Period of the fixes in "thinned" [s].
+        q: Densities of the white acceleration of the bank's models [m^2/s^3].
+        position_sigma: Standard deviation of a fix, each axis [m].
+        initial_speed_sigma: Prior standard deviation of the velocity, each axis [m/s].
+        reset_period_s: Period T of IMMAE's assessment [s].
+        reset_threshold: Threshold of IMMAE's assessment in (0, 1].
+        weight_floor: Lower bound of the "floor" bank's weights.
+        switching: Probability per step that the "markov" bank's model changes.
+        seed: Not used by a recorded log; kept in the summary.
+    """
+
+    log: Path | None = None
+    scenario: Literal["full-rate", "thinned", "all"] = "full-rate"
+    thin_period_s: float = 1.0
+    q: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0)
+    position_sigma: float = 0.02
+    initial_speed_sigma: float = 10.0
+    reset_period_s: float = 5.0
+    reset_threshold: float = 0.9
+    weight_floor: float = 1e-3
+    switching: float = 0.02
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing.
+
+        Raises:
+            ConfigError: With one sentence naming the field, its value and what is accepted.
+        """
+        require_choice(self, "scenario")
+        require_positive(
+            self, "thin_period_s", "position_sigma", "initial_speed_sigma", "reset_period_s"
+        )
+        require_positive(self, "q")
+        require(
+            0 < self.reset_threshold <= 1, "reset_threshold", self.reset_threshold, "in (0, 1]"
+        )
+        require(
+            0 < self.weight_floor < 1 / len(self.q),
+            "weight_floor",
+            self.weight_floor,
+            f"positive and below 1 / {len(self.q)}, the equal weight",
+        )
+        require(0 < self.switching < 1, "switching", self.switching, "between 0 and 1")

@@ -1,0 +1,260 @@
+"""The study as a whole: one recorded track, every single filter and every bank."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxnav.datasets import DataError, GnssTrack, gaps, intervals_s, load_rtklib_pos, thin
+from jaxnav.estimation.banks.mixture import BankParams, panel
+from jaxnav.estimation.banks.weights import (
+    WindowedReset,
+    bayes,
+    chain,
+    fixed,
+    floor,
+    markov,
+    windowed_reset,
+)
+from jaxnav.estimation.filters.kalman import kf
+from jaxnav.estimation.run import run
+from jaxnav.estimation.types import FilterParams, Gaussian, Obs, WeightRule, replicate
+from jaxnav.navigation.earth import enu_from_geodetic
+from jaxnav.navigation.models.kinematic import (
+    KinematicInput,
+    KinematicParams,
+    constant_velocity,
+)
+from jaxnav.studies.base import ConfigError, StudyResult, plain, require_x64
+from jaxnav.studies.gnss_track.config import SCENARIOS, GnssTrackConfig
+
+MODEL = constant_velocity(axes=2)
+BANKS: dict[str, WeightRule] = {
+    "mmae": bayes(),
+    "immae": chain(bayes(), windowed_reset()),
+    "floor": chain(bayes(), floor()),
+    "markov": chain(markov(), bayes()),
+}
+BLOCKS = 30
+"""Stretches of equal length whose scatter gives the standard error of a time average."""
+
+
+class TrackData(NamedTuple):
+    """A track as the filters see it: the first fix is the prior, the others are observations.
+
+    Attributes:
+        time: ``(T,) [s]`` since the first fix.
+        inputs: Step lengths, ``(T,)``.
+        observations: East and north ``(T, 2) [m]`` from the first fix.
+        velocity: East and north ``(T, 2) [m/s]`` by the receiver's Doppler, or ``None``.
+        initial: Prior at the first fix.
+    """
+
+    time: np.ndarray
+    inputs: KinematicInput
+    observations: Obs
+    velocity: np.ndarray | None
+    initial: Gaussian
+
+
+def run_study(
+    config: GnssTrackConfig, progress: Callable[[str, int, int], None] | None = None
+) -> list[StudyResult]:
+    """Run one scenario, or both.
+
+    Args:
+        config: The configuration; ``log`` must be given.
+        progress: Called with (scenario, tracks done, tracks).
+
+    Returns:
+        One result per scenario.
+
+    Raises:
+        ConfigError: If no log is given, or 64-bit floats are off.
+        DataError: If the log is malformed or too short.
+    """
+    require_x64()
+    if config.log is None:
+        raise ConfigError("log is not given; it must be the path of an RTKLIB .pos file (--log)")
+    track = load_rtklib_pos(config.log)
+    names = tuple(SCENARIOS) if config.scenario == "all" else (config.scenario,)
+    results = []
+    for name in names:
+        results.append(_run_scenario(replace(config, scenario=name), track))
+        if progress is not None:
+            progress(name, 1, 1)
+    return results
+
+
+def track_data(config: GnssTrackConfig, track: GnssTrack) -> TrackData:
+    """Return a track in the local level frame of its first fix.
+
+    Raises:
+        DataError: If it has fewer than three fixes at the scenario's rate.
+    """
+    if config.scenario == "thinned":
+        track = thin(track, config.thin_period_s)
+    if len(track.time_ns) < 3:
+        raise DataError(
+            f"{track.source} has {len(track.time_ns)} fixes at the rate of {config.scenario}; "
+            "a filter needs at least 3"
+        )
+    geodetic = jnp.asarray(track.geodetic)
+    level = jax.vmap(enu_from_geodetic, in_axes=(0, None))(geodetic, geodetic[0])[:, :2]
+    sigma = jnp.array([config.position_sigma] * 2 + [config.initial_speed_sigma] * 2)
+    seconds = 1e-9 * (track.time_ns - track.time_ns[0]).astype(float)
+    return TrackData(
+        time=seconds[1:],
+        inputs=KinematicInput(jnp.asarray(intervals_s(track)[1:])),
+        observations=Obs(level[1:], jnp.ones((len(seconds) - 1, 2), bool)),
+        velocity=None if track.velocity is None else track.velocity[1:, :2],
+        initial=Gaussian(jnp.zeros(4), jnp.diag(sigma**2)),
+    )
+
+
+def filter_params(density: Array | float, config: GnssTrackConfig, data: TrackData) -> FilterParams:
+    """Return the parameters of a single filter with one density [m^2/s^3]."""
+    model = KinematicParams(jnp.asarray(density), jnp.asarray(config.position_sigma))
+    return FilterParams(model, data.initial)
+
+
+def single_ids(config: GnssTrackConfig) -> tuple[str, ...]:
+    """Return the method ids of the single filters."""
+    return tuple(f"kf-{q:g}" for q in config.q)
+
+
+def panel_params(config: GnssTrackConfig, data: TrackData) -> BankParams:
+    """Return the parameters of all methods over one set of members."""
+    count = len(config.q)
+    members = replicate(filter_params(1.0, config, data), count)
+    members = members._replace(model=members.model._replace(density=jnp.array(config.q)))
+    period = config.reset_period_s / float(np.median(np.asarray(data.inputs.dt)))
+    if period < 1:
+        raise ConfigError(
+            f"reset_period_s is {config.reset_period_s}; it must be at least one step of "
+            f"{config.reset_period_s / period:g} s"
+        )
+    rules: dict[str, Any] = {
+        "mmae": (),
+        "immae": ((), WindowedReset(jnp.array(period), jnp.array(config.reset_threshold))),
+        "floor": ((), jnp.array(config.weight_floor)),
+        "markov": (jnp.array(config.switching), ()),
+    }
+    priors: dict[str, Array | None] = dict.fromkeys(rules)
+    for j, name in enumerate(single_ids(config)):
+        rules[name] = ()
+        priors[name] = jnp.where(jnp.arange(count) == j, 0.0, -jnp.inf)
+    return BankParams(members, rules, priors)
+
+
+def _run_scenario(config: GnssTrackConfig, track: GnssTrack) -> StudyResult:
+    data = track_data(config, track)
+    rules = {**dict.fromkeys(single_ids(config), fixed()), **BANKS}
+    comparison = panel(kf(MODEL), rules)
+
+    def record(state: Any, info: Any) -> tuple[Array, Array, Array]:
+        estimate = comparison.estimate(state)
+        mean = jnp.stack([estimate[name].mean for name in rules])
+        likelihood = jnp.stack([info[name].log_likelihood for name in rules])
+        return mean, likelihood, jnp.stack([jnp.exp(state.log_weights[name]) for name in BANKS])
+
+    params = panel_params(config, data)
+    trace = run(comparison, params, data.inputs, data.observations, record=record)
+    mean, likelihood, weights = (np.asarray(leaf) for leaf in trace.record)
+    return StudyResult(
+        study="gnss-track",
+        scenario=config.scenario,
+        runs=1,
+        seed=config.seed,
+        config={**plain(config), "log": str(config.log)},
+        methods=_measures(tuple(rules), mean, likelihood, data),
+        published={},
+        claims=[],
+        arrays=_arrays(config, tuple(rules), mean, likelihood, weights, data),
+        dims={
+            "time": ("time",),
+            "fix": ("time", "axis"),
+            "estimate": ("time", "method", "component"),
+            "log_likelihood": ("time", "method"),
+            "weights": ("time", "bank", "model"),
+            "doppler": ("time", "axis"),
+        },
+        notes=_notes(config, track, data),
+    )
+
+
+def _arrays(
+    config: GnssTrackConfig,
+    methods: tuple[str, ...],
+    mean: np.ndarray,
+    likelihood: np.ndarray,
+    weights: np.ndarray,
+    data: TrackData,
+) -> dict[str, Any]:
+    fixes = np.asarray(data.observations.z)
+    missing = np.full_like(fixes, np.nan)
+    return {
+        "time": data.time,
+        "fix": fixes,
+        "estimate": mean,
+        "log_likelihood": likelihood,
+        "weights": weights,
+        "doppler": missing if data.velocity is None else data.velocity,
+        "method": np.array(methods),
+        "bank": np.array(tuple(BANKS)),
+        "model": np.array(config.q),
+        "axis": np.array(("east", "north")),
+        "component": np.array(("east", "north", "east velocity", "north velocity")),
+    }
+
+
+def _measures(
+    methods: tuple[str, ...], mean: np.ndarray, likelihood: np.ndarray, data: TrackData
+) -> dict[str, dict[str, Any]]:
+    measures: dict[str, dict[str, Any]] = {}
+    for i, name in enumerate(methods):
+        total = likelihood[:, i]
+        entry: dict[str, Any] = {
+            "log_likelihood": float(total.sum()),
+            "log_likelihood_se": _block_se(total) * total.size,
+            "diverged": int(not np.all(np.isfinite(mean[:, i]))),
+        }
+        if data.velocity is not None:
+            square = np.sum((mean[:, i, 2:] - data.velocity) ** 2, axis=-1)
+            value = float(np.sqrt(square.mean()))
+            se = _block_se(square) / (2 * value)
+            entry["rmse"] = {"velocity": {"value": value, "se": se, "unit": "m/s"}}
+        measures[name] = entry
+    return measures
+
+
+def _block_se(values: np.ndarray) -> float:
+    """Return the standard error of a time average from the scatter of block means."""
+    length = values.size // BLOCKS
+    if length < 1:
+        return float("nan")
+    means = values[: BLOCKS * length].reshape(BLOCKS, length).mean(axis=1)
+    return float(np.std(means, ddof=1) / np.sqrt(BLOCKS))
+
+
+def _notes(config: GnssTrackConfig, track: GnssTrack, data: TrackData) -> list[str]:
+    steps = np.asarray(data.inputs.dt)
+    notes = [
+        f"{steps.size} steps of {np.median(steps):g} s after the first fix of {track.source}; "
+        f"standard errors from {BLOCKS} blocks of the track."
+    ]
+    if track.duplicates:
+        notes.append(f"{track.duplicates} fixes with a repeated time stamp were left out.")
+    missing = gaps(thin(track, config.thin_period_s) if config.scenario == "thinned" else track)
+    if missing.size:
+        longest = float(np.max(steps[missing - 1]))
+        notes.append(
+            f"{missing.size} gaps in the log, the longest {longest:g} s, were predicted over."
+        )
+    if data.velocity is None:
+        notes.append("The log has no velocity: the estimates are not scored against one.")
+    return notes
