@@ -106,7 +106,9 @@ def fit(
 
     @jax.jit
     def improve(gradient: Any, memory: Any, point: Any) -> tuple[Any, Any]:
-        return chosen.update(gradient, memory, point)
+        # optax mixes integer counts with floats, whatever the caller's promotion rules are.
+        with jax.numpy_dtype_promotion("standard"):
+            return chosen.update(gradient, memory, point)
 
     value, gradient = evaluate(point)
     if not (_finite(value) and _finite(gradient)):

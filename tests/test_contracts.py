@@ -1,0 +1,374 @@
+"""The laws that every filter and bank obeys, over one table of all of them."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+from jax.test_util import check_grads
+
+from jaxnav.estimation.banks.mixture import BankParams, bank, immae, mmae
+from jaxnav.estimation.banks.weights import (
+    WindowedReset,
+    bayes,
+    chain,
+    floor,
+    forget,
+    markov,
+)
+from jaxnav.estimation.bounds import oracle
+from jaxnav.estimation.filters.kalman import kf
+from jaxnav.estimation.filters.square_root import square_root_kf
+from jaxnav.estimation.run import Trace, run
+from jaxnav.estimation.tune import negative_log_likelihood
+from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs, replicate
+from tests.oracles.kalman import (
+    History,
+    Linear,
+    bayes_weights,
+    floor_weights,
+    immae_weights,
+    kalman,
+    markov_weights,
+    mixture,
+)
+
+STEPS, RUNS, STATES, CHANNELS = 12, 6, 4, 2
+THETA = (0.2, 1.0, 8.0)
+
+
+class Noise(NamedTuple):
+    """Parameters of the test's model: factors on Q and R."""
+
+    q: Array
+    r: Array
+
+
+class Step(NamedTuple):
+    """Input of the test's model: a dense transition that changes from step to step."""
+
+    Phi: Array
+    Q: Array
+    offset: Array
+
+
+OBSERVATION = np.array([[1.0, 0.0, 0.5, 0.0], [0.0, 1.0, 0.0, -0.3]])
+NOISE = np.array([[0.5, 0.1], [0.1, 0.8]])
+
+
+def dense_model() -> Model:
+    """A linear model with dense matrices, an offset in both equations and correlated noise."""
+
+    def dtype_of(x: Array, constant: np.ndarray) -> Array:
+        return jnp.asarray(constant, x.dtype)
+
+    return Model(
+        transition=lambda p, x, u: u.Phi @ x + u.offset,
+        process_noise=lambda p, x, u: p.q * u.Q,
+        observe=lambda p, x, u: dtype_of(x, OBSERVATION) @ x + u.offset[:CHANNELS],
+        observation_noise=lambda p, x, u: p.r * dtype_of(x, NOISE),
+    )
+
+
+def single(theta: float = 1.0) -> FilterParams:
+    """Parameters of one filter; the true model has theta = 1."""
+    prior = Gaussian(jnp.array([0.5, -0.5, 0.1, 0.0]), jnp.diag(jnp.array([1.0, 2.0, 0.5, 0.5])))
+    return FilterParams(Noise(jnp.array(theta), jnp.array(1.0)), prior)
+
+
+def members(*theta: float) -> FilterParams:
+    """Members of a bank that differ in the process noise."""
+    base = replicate(single(), len(theta))
+    return base._replace(model=base.model._replace(q=jnp.array(theta)))
+
+
+class Case(NamedTuple):
+    """A filter with its parameters, and the same made of members that are all alike."""
+
+    filter: Filter
+    params: Any
+    alike: Any
+
+
+def _cases() -> dict[str, Case]:
+    base = kf(dense_model())
+    singles = {
+        "kf": base,
+        "square_root_kf": square_root_kf(dense_model()),
+        "oracle": oracle(base, lambda params, u: params),
+    }
+    reset = WindowedReset(jnp.array(5.0), jnp.array(0.9), jnp.array(0.05))
+    banks: dict[str, tuple[Filter, Any]] = {
+        "mmae": (mmae(base), ()),
+        "mmae of square roots": (mmae(square_root_kf(dense_model())), ()),
+        "immae": (immae(base), ((), reset)),
+        "immae, smooth": (immae(base, smooth=True), ((), reset)),
+        "floor": (bank(base, chain(bayes(), floor())), ((), jnp.array(1e-3))),
+        "forget": (bank(base, chain(forget(), bayes())), (jnp.array(0.95), ())),
+        "markov": (bank(base, chain(markov(), bayes())), (jnp.array(0.05), ())),
+    }
+    cases = {name: Case(made, single(), single()) for name, made in singles.items()}
+    for name, (made, rule) in banks.items():
+        cases[name] = Case(
+            made, BankParams(members(*THETA), rule), BankParams(members(1.0, 1.0, 1.0), rule)
+        )
+    cases["bank of one"] = Case(
+        mmae(base), BankParams(members(1.0), ()), BankParams(members(1.0), ())
+    )
+    return cases
+
+
+CASES = _cases()
+each_case = pytest.mark.parametrize("name", CASES)
+
+
+class Problem(NamedTuple):
+    """Data for a batch of runs that share the model's inputs."""
+
+    inputs: Step
+    z: Array
+    valid: Array
+
+
+def _problem() -> Problem:
+    rng = np.random.default_rng(5)
+    Phi = np.eye(STATES) + 0.2 * rng.normal(size=(STEPS, STATES, STATES))
+    G = 0.3 * rng.normal(size=(STEPS, STATES, STATES))
+    inputs = Step(
+        jnp.array(Phi),
+        jnp.array(G @ G.transpose(0, 2, 1)),
+        jnp.array(rng.normal(size=(STEPS, STATES))),
+    )
+    valid = rng.uniform(size=(STEPS, CHANNELS)) > 0.25
+    valid[3] = False
+    return Problem(
+        inputs, jnp.array(2 * rng.normal(size=(RUNS, STEPS, CHANNELS))), jnp.array(valid)
+    )
+
+
+PROBLEM = _problem()
+_COMPILED: dict[str, Callable[..., Trace]] = {}
+
+
+def batch_run(name: str, params: Any, z: Array) -> Trace:
+    """Run a case over a batch of measurements; compiled once per case."""
+    if name not in _COMPILED:
+        filter = CASES[name].filter
+        _COMPILED[name] = jax.jit(
+            jax.vmap(
+                lambda params, z: run(filter, params, PROBLEM.inputs, Obs(z, PROBLEM.valid)),
+                in_axes=(None, 0),
+            )
+        )
+    return _COMPILED[name](params, z)
+
+
+def reference(theta: float, z: np.ndarray, valid: np.ndarray) -> History:
+    """The NumPy filter with offsets moved into the data."""
+    steps = jax.tree.map(np.asarray, PROBLEM.inputs)
+    # an offset is one more state that stays one
+    Phi = np.zeros((STEPS, STATES + 1, STATES + 1))
+    Phi[:, :STATES, :STATES], Phi[:, :STATES, STATES], Phi[:, STATES, STATES] = (
+        steps.Phi,
+        steps.offset,
+        1,
+    )
+    Q = np.zeros_like(Phi)
+    Q[:, :STATES, :STATES] = theta * steps.Q
+    prior = single().initial
+    P0 = np.zeros((STATES + 1, STATES + 1))
+    P0[:STATES, :STATES] = prior.cov
+    H = np.hstack([OBSERVATION, np.zeros((CHANNELS, 1))])
+    model = Linear(Phi, Q, H, NOISE, np.append(prior.mean, 1.0), P0)
+    full = kalman(model, z - steps.offset[:, :CHANNELS], valid)
+    return History(full.mean[:, :STATES], full.cov[:, :STATES, :STATES], full.log_likelihood)
+
+
+@each_case
+def test_members_alike_equal_the_kalman_filter(name: str) -> None:
+    trace = batch_run(name, CASES[name].alike, PROBLEM.z)
+    estimate, info = trace.record
+    for run_index in range(2):
+        expected = reference(1.0, np.asarray(PROBLEM.z[run_index]), np.asarray(PROBLEM.valid))
+        np.testing.assert_allclose(estimate.mean[run_index], expected.mean, atol=1e-11)
+        np.testing.assert_allclose(estimate.cov[run_index], expected.cov, atol=1e-11)
+        np.testing.assert_allclose(
+            info.log_likelihood[run_index], expected.log_likelihood, atol=1e-11
+        )
+
+
+WEIGHTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "mmae": bayes_weights,
+    "mmae of square roots": bayes_weights,
+    "immae": lambda rows: immae_weights(rows, 5, 0.9),
+    "floor": lambda rows: floor_weights(rows, 1e-3),
+    "markov": lambda rows: markov_weights(rows, 0.05),
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_bank_equals_the_loop_over_models(name: str) -> None:
+    estimate, _ = batch_run(name, CASES[name].params, PROBLEM.z).record
+    for run_index in range(RUNS):
+        z = np.asarray(PROBLEM.z[run_index])
+        histories = [reference(theta, z, np.asarray(PROBLEM.valid)) for theta in THETA]
+        rows = np.stack([history.log_likelihood for history in histories], axis=1)
+        mean, cov = mixture(histories, WEIGHTS[name](rows))
+        np.testing.assert_allclose(estimate.mean[run_index], mean, atol=1e-10)
+        np.testing.assert_allclose(estimate.cov[run_index], cov, atol=1e-10)
+
+
+@each_case
+def test_covariance_is_symmetric_and_positive(name: str) -> None:
+    estimate, _ = batch_run(name, CASES[name].params, PROBLEM.z).record
+    cov = np.asarray(estimate.cov)
+    np.testing.assert_allclose(cov, cov.swapaxes(-1, -2), atol=1e-15)
+    assert np.linalg.eigvalsh(cov).min() > 0
+
+
+@each_case
+def test_order_of_the_batch_does_not_matter(name: str) -> None:
+    order = jnp.array([3, 1, 5, 0, 4, 2])
+    plain = batch_run(name, CASES[name].params, PROBLEM.z).record
+    mixed = batch_run(name, CASES[name].params, PROBLEM.z[order]).record
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(mixed), strict=True):
+        np.testing.assert_array_equal(a[order], b)
+
+
+@each_case
+def test_poisoned_run_leaves_the_others_bitwise_unchanged(name: str) -> None:
+    plain = batch_run(name, CASES[name].params, PROBLEM.z).record
+    poisoned = batch_run(name, CASES[name].params, PROBLEM.z.at[2, 1, 0].set(jnp.nan)).record
+    others = np.array([0, 1, 3, 4, 5])
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(poisoned), strict=True):
+        np.testing.assert_array_equal(a[others], b[others])
+    assert not np.all(np.isfinite(poisoned[0].mean[2]))
+
+
+@each_case
+def test_value_of_an_invalid_channel_is_never_used(name: str) -> None:
+    plain = batch_run(name, CASES[name].params, PROBLEM.z)
+    lost = jnp.where(PROBLEM.valid, PROBLEM.z, jnp.nan)
+    for a, b in zip(
+        jax.tree.leaves(plain),
+        jax.tree.leaves(batch_run(name, CASES[name].params, lost)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+@each_case
+def test_step_without_observation_is_a_prediction(name: str) -> None:
+    filter, params, _ = CASES[name]
+    inputs = jax.tree.map(lambda leaf: leaf[0], PROBLEM.inputs)
+    nothing = Obs(jnp.full(CHANNELS, jnp.inf), jnp.zeros(CHANNELS, bool))
+
+    @jax.jit
+    def step(params: Any) -> tuple[Gaussian, Gaussian, Any]:
+        predicted = filter.predict(params, filter.init(params), inputs)
+        state, info = filter.update(params, predicted, inputs, nothing)
+        return filter.estimate(predicted), filter.estimate(state), info
+
+    before, after, info = step(params)
+    np.testing.assert_allclose(after.mean, before.mean, rtol=1e-15)
+    np.testing.assert_allclose(after.cov, before.cov, rtol=1e-14, atol=1e-16)
+    assert info.log_likelihood == 0
+    assert info.nis == 0
+    assert info.flags == Flag.NO_OBSERVATION
+
+
+@each_case
+def test_dtype_in_is_dtype_out(name: str) -> None:
+    filter, params, _ = CASES[name]
+    narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
+    inputs = jax.tree.map(lambda leaf: leaf[0].astype(jnp.float32), PROBLEM.inputs)
+    obs = Obs(PROBLEM.z[0, 0].astype(jnp.float32), jnp.ones(CHANNELS, bool))
+
+    def step(params: Any) -> tuple[Any, Any, Gaussian]:
+        state, info = filter.update(
+            params, filter.predict(params, filter.init(params), inputs), inputs, obs
+        )
+        return state, info, filter.estimate(state)
+
+    compiled = jax.jit(step)(narrow)
+    for leaf in jax.tree.leaves(compiled):
+        assert leaf.dtype in (jnp.float32, jnp.int32), leaf
+    if name in ("kf", "square_root_kf", "immae", "markov"):
+        # op by op is slow, and between them these cases hold every kernel
+        for a, b in zip(jax.tree.leaves(step(narrow)), jax.tree.leaves(compiled), strict=True):
+            np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5)
+
+
+@each_case
+def test_second_call_does_not_trace_again(name: str) -> None:
+    filter, params, _ = CASES[name]
+    traced = 0
+
+    def record(state: Any, info: Any) -> Any:
+        nonlocal traced
+        traced += 1
+        return info.nis
+
+    for run_index in range(2):
+        observations = Obs(PROBLEM.z[run_index], PROBLEM.valid)
+        run(filter, params, PROBLEM.inputs, observations, record=record)
+    assert traced == 1
+
+
+@each_case
+def test_gradient_of_the_likelihood(name: str) -> None:
+    filter, params, _ = CASES[name]
+    observations = Obs(PROBLEM.z[0], PROBLEM.valid)
+
+    def loss(log_noise: Array) -> Array:
+        factors = jnp.exp(log_noise)
+        inner = params.members if isinstance(params, BankParams) else params
+        moved = inner._replace(
+            model=Noise(inner.model.q * factors[0], inner.model.r * factors[1])
+        )
+        whole = params._replace(members=moved) if isinstance(params, BankParams) else moved
+        return negative_log_likelihood(filter, whole, PROBLEM.inputs, observations)
+
+    check_grads(jax.jit(loss), (jnp.array([0.1, -0.2]),), order=1, modes=["fwd", "rev"], rtol=1e-7)
+
+
+def test_covariance_is_shared_by_runs_that_share_their_inputs() -> None:
+    """The covariance recursion stays unbatched when only the measurements are mapped."""
+    case = CASES["kf"]
+
+    def covariance_and_mean(z: Array) -> tuple[Array, Array]:
+        final = run(case.filter, case.params, PROBLEM.inputs, Obs(z, PROBLEM.valid)).final
+        return final.P, final.x
+
+    # vmap refuses an output axis of None unless the value does not depend on the mapped input
+    P, x = jax.vmap(covariance_and_mean, out_axes=(None, 0))(PROBLEM.z)
+    assert P.shape == (STATES, STATES)
+    assert x.shape == (RUNS, STATES)
+
+
+def test_segments_change_neither_value_nor_gradient() -> None:
+    case = CASES["immae, smooth"]
+    observations = Obs(PROBLEM.z[0], PROBLEM.valid)
+
+    def loss(q: Array, segment: int) -> Array:
+        params = case.params._replace(members=members(1.0, 1.0, 1.0))
+        model = params.members.model._replace(q=q * jnp.array(THETA))
+        params = params._replace(members=params.members._replace(model=model))
+        return negative_log_likelihood(
+            case.filter, params, PROBLEM.inputs, observations, segment=segment
+        )
+
+    graded = jax.jit(jax.value_and_grad(loss), static_argnums=1)
+    for segment in (5, 4):
+        np.testing.assert_allclose(
+            graded(jnp.array(1.3), segment), graded(jnp.array(1.3), 0), rtol=1e-12
+        )
+
+
+def test_run_refuses_lengths_that_differ() -> None:
+    case = CASES["kf"]
+    with pytest.raises(ValueError, match=r"\[11, 12\] steps"):
+        run(case.filter, case.params, PROBLEM.inputs, Obs(PROBLEM.z[0, 1:], PROBLEM.valid[1:]))

@@ -1,0 +1,123 @@
+"""Tuning by gradient: transforms, rejected steps, and noise that is found again."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxnav.datasets import load_rtklib_pos
+from jaxnav.estimation.filters.kalman import kf
+from jaxnav.estimation.tune import POSITIVE, UNIT, fit, negative_log_likelihood
+from jaxnav.estimation.types import FilterParams, Gaussian, Obs
+from jaxnav.navigation.models.sins_cns import sins_cns_attitude
+from jaxnav.studies.gnss_track.config import GnssTrackConfig
+from jaxnav.studies.gnss_track.study import MODEL, filter_params, track_data
+from jaxnav.studies.immae.config import ImmaeConfig
+from jaxnav.studies.immae.simulation import World, build_world, fly_linear, noise_of, prior_sigma
+
+DRIVE = Path(__file__).resolve().parents[2] / "shared" / "data" / "rtk_drive"
+
+
+def test_fit_finds_the_minimum_of_a_bowl_in_constrained_coordinates() -> None:
+    def loss(params: dict[str, jax.Array]) -> jax.Array:
+        return (params["a"] - 3.0) ** 2 + (params["b"] - 0.2) ** 2
+
+    found = fit(
+        loss, {"a": 1.0, "b": 0.9}, transform={"a": POSITIVE, "b": UNIT}, steps=400
+    )
+    assert abs(found.params["a"] - 3.0) < 1e-3
+    assert abs(found.params["b"] - 0.2) < 1e-3
+    assert found.loss == np.nanmin(found.history)
+    assert found.rejected == 0
+
+
+def test_fit_takes_back_steps_that_are_not_finite() -> None:
+    def cliff(params: jax.Array) -> jax.Array:
+        return jnp.where(params > 2.0, jnp.nan, (params - 1.9) ** 2)
+
+    found = fit(cliff, 1.0, optimiser=optax.sgd(10.0), steps=40)
+    assert found.rejected > 0
+    assert np.isnan(found.history).sum() == found.rejected
+    assert found.params <= 2.0
+    assert found.loss <= (1.0 - 1.9) ** 2
+
+
+def test_fit_refuses_a_start_outside_the_domain_or_without_a_loss() -> None:
+    with pytest.raises(ValueError, match=r"-1\.0 is outside the domain"):
+        fit(lambda p: p, -1.0)
+    with pytest.raises(ValueError, match=r"not finite at 1\.0"):
+        fit(lambda p: p * jnp.nan, 1.0)
+
+
+@pytest.fixture(scope="module")
+def short_world() -> tuple[ImmaeConfig, World]:
+    config = ImmaeConfig(
+        scenario="matched-noise", duration_s=100.0, chain="linear", initial="drawn"
+    )
+    return config, build_world(config)
+
+
+def _loss_of_scale(config: ImmaeConfig, world: World, runs: int):
+    """Negative log-likelihood of 16 simulated runs as a function of the factor on Q0."""
+    keys = jax.random.split(jax.random.key(11), runs)
+    flights = jax.jit(
+        jax.vmap(lambda key: fly_linear(key, world, config.filter_period_s, config.imu_step).z)
+    )(keys)
+    filter = kf(sins_cns_attitude(config.filter_period_s, config.imu_step))
+    # phi and eps are the first and the fourth block of P0
+    sigma = prior_sigma(config)[jnp.array([0, 1, 2, 9, 10, 11])]
+    initial = Gaussian(jnp.zeros(6), jnp.diag(sigma**2))
+    valid = jnp.ones(flights.shape[1:], bool)
+
+    def loss(scale: jax.Array) -> jax.Array:
+        params = FilterParams(noise_of(config)._replace(noise_scale=scale), initial)
+        per_run = jax.vmap(
+            lambda z: negative_log_likelihood(
+                filter, params, world.nominal, Obs(z, valid), segment=45
+            )
+        )(flights)
+        return jnp.mean(per_run)
+
+    return loss
+
+
+def test_noise_wrong_by_four_is_found_again(short_world: tuple[ImmaeConfig, World]) -> None:
+    config, world = short_world
+    loss = _loss_of_scale(config, world, 16)
+    found = fit(loss, 4.0, steps=60)
+    assert abs(found.params - 1.0) < 0.15
+    assert found.rejected == 0
+
+    value = jax.jit(loss)
+    gradient = float(jax.jit(jax.grad(loss))(jnp.array(2.0)))
+    h = 1e-4
+    central = float(value(jnp.array(2.0 + h)) - value(jnp.array(2.0 - h))) / (2 * h)
+    assert abs(gradient - central) < 1e-6 * abs(central)
+
+
+@pytest.mark.skipif(not DRIVE.is_dir(), reason="the recorded drive is not in ../shared/data")
+def test_density_fitted_on_the_first_half_predicts_the_second_better() -> None:
+    config = GnssTrackConfig(log=DRIVE / "gnss_1934_sf.pos")
+    data = track_data(config, load_rtklib_pos(DRIVE / "gnss_1934_sf.pos"))
+    half = data.time.size // 2
+    filter = kf(MODEL)
+
+    def loss(density: jax.Array, part: slice) -> jax.Array:
+        inputs = jax.tree.map(lambda leaf: leaf[part], data.inputs)
+        observations = jax.tree.map(lambda leaf: leaf[part], data.observations)
+        params = filter_params(density, config, data)
+        start = data.observations.z[part][0]
+        initial = params.initial._replace(mean=jnp.concatenate([start, jnp.zeros(2)]))
+        return negative_log_likelihood(
+            filter, params._replace(initial=initial), inputs, observations
+        )
+
+    first, second = slice(0, half), slice(half, None)
+    found = fit(lambda q: loss(q, first), 10.0, steps=60)
+    # the first half prefers a density between the two best of the bank's models
+    assert 0.1 < found.params < 1.0
+    hand_set = min(float(loss(jnp.array(q), second)) for q in config.q)
+    assert float(loss(found.params, second)) < hand_set
