@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, PartitionSpec
 
 from benchmarks._problem import THETA, Dense
 
+TILE = 16
 Series = Callable[[Array, Array, Array], tuple[Array, Array]]
 """``(F (T, 15, 15), G (T, 15, 6), z (T, 3)) -> (attitude (T, 3), log-likelihood)`` of one model."""
 
@@ -110,7 +110,9 @@ def cuthbert_series(H: Array, R: Array, P0: Array) -> Series:
 def jax_calls(series: Callable[[Array, Array, Array], Series]) -> Callable[[Dense], dict]:
     """Return how a user runs a JAX filter over models and runs: ``vmap`` and ``jit``.
 
-    Once as it is, with XLA free to use both cores, and once with the runs split over the devices.
+    Once as it is and once in tiles of runs, XLA being free to use both cores. Splitting the runs over
+    two host devices is no third way: batched LAPACK calls of two devices can wait for each other's
+    threads for ever.
     """
 
     def prepare(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
@@ -122,20 +124,16 @@ def jax_calls(series: Callable[[Array, Array, Array], Series]) -> Callable[[Dens
             return jax.vmap(each)(jnp.array(THETA))
 
         batch = jax.vmap(models, in_axes=(axis, axis, 0))
-        mesh = Mesh(np.array(jax.local_devices()), ("runs",))
-        spread, whole = PartitionSpec("runs"), PartitionSpec()
-        matrices = spread if problem.own else whole
-        split = jax.shard_map(
-            batch,
-            mesh=mesh,
-            in_specs=(matrices, matrices, spread),
-            out_specs=spread,
-            check_vma=False,
-        )
+
+        def tiled(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
+            if problem.own:
+                return jax.lax.map(lambda run: models(*run), (F, G, z), batch_size=TILE)
+            return jax.lax.map(lambda one: models(F, G, one), z, batch_size=TILE)
+
         values = tuple(jnp.asarray(m) for m in (problem.F, problem.G, problem.z))
         calls = {"vmap": jax.jit(batch)}
-        if len(problem.z) % mesh.size == 0:
-            calls["devices"] = jax.jit(split)
+        if len(problem.z) > TILE:
+            calls["tiles"] = jax.jit(tiled)
         return {name: lambda call=call: call(*values) for name, call in calls.items()}
 
     return prepare
@@ -200,19 +198,16 @@ def prepare_numpy(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
 def prepare_c(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
     """Return the C loop of ``kalman.c``, compiled for this machine, on one core."""
     function = _compiled().kalman_bank
+    function.argtypes = [ctypes.c_long] * 4 + [np.ctypeslib.ndpointer(flags="C")] * 10
+    function.restype = None
     runs, steps, models = *problem.z.shape[:2], len(THETA)
-    matrices = [problem.F, problem.Q, np.array(THETA), problem.H, problem.R, problem.P0, problem.z]
+    matrices = (problem.F, problem.Q, np.array(THETA), problem.H, problem.R, problem.P0, problem.z)
     given = [np.ascontiguousarray(m) for m in matrices]
-    x, total = np.empty((runs * models, 15)), np.empty((runs, models))
-    attitude = np.empty((runs, models, steps, 3))
-    if not problem.own:
-        attitude, total = (m.reshape(models, runs, *m.shape[2:]) for m in (attitude, total))
-    pointers = [ctypes.c_void_p(m.ctypes.data) for m in (*given, x, attitude, total)]
-    sizes = [ctypes.c_long(n) for n in (int(problem.own), runs, models, steps)]
+    lanes = (runs, models) if problem.own else (models, runs)
+    x, attitude, total = (np.empty((*lanes, *rest)) for rest in ((15,), (steps, 3), ()))
 
-    def call(keep: Any = given) -> tuple[np.ndarray, np.ndarray]:
-        del keep  # the pointers do not own what they point to
-        function(*sizes, *pointers)
+    def call() -> tuple[np.ndarray, np.ndarray]:
+        function(problem.own, runs, models, steps, *given, x, attitude, total)
         return (attitude, total) if problem.own else (attitude.swapaxes(0, 1), total.T)
 
     return {"one core": call}

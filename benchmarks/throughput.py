@@ -48,6 +48,8 @@ CHECKED = 2
 CASES = {"shared": False, "own": True}
 GOALS_US = {"shared": 0.12, "own": 0.6}
 GOAL_RATIO = 4.0
+DENSE_LANE_STEPS = 200_000
+"""Filter steps of the dense path in one timed call, so that its matrices fit the memory."""
 
 
 class Statistics(NamedTuple):
@@ -190,3 +192,78 @@ def time_contestant(contestant: Contestant, matrices: Dense, repeats: int) -> Ti
         lanes = runs * part.z.shape[1] * len(THETA)
         timed.append(Timed(first, 1e6 * best / lanes, spread))
     return min(timed, key=lambda one: one.us)
+
+
+def shortened(matrices: Dense, runs: int, steps: int) -> Dense:
+    """Return the first runs and steps of a problem."""
+    F, G = (m[:runs, :steps] if matrices.own else m[:steps] for m in (matrices.F, matrices.G))
+    return matrices._replace(F=F, G=G, z=matrices.z[:runs, :steps])
+
+
+def jaxnav_rows(problem: Problem, case: str, repeats: int) -> dict[str, Timed]:
+    """Time the library with and without the model's structure."""
+    own = CASES[case]
+    matrices = dense(problem, own)
+    runs = len(matrices.z)
+    part = shortened(matrices, runs, DENSE_LANE_STEPS // (runs * len(THETA)))
+    structured = structured_call(problem, own)
+    return {
+        "jaxnav": time_study("jaxnav", structured, matrices, ARCSEC, repeats),
+        "jaxnav, dense F": time_study("jaxnav, dense F", dense_call(part), part, 1.0, repeats),
+    }
+
+
+def measure(steps: int, repeats: int) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the rows of the table, and a note for each contestant that is missing."""
+    rows, notes = [], {}
+    for case in CASES:
+        for runs in RUNS:
+            problem = make_problem(steps, runs)
+            timed = jaxnav_rows(problem, case, repeats)
+            for contestant in CONTESTANTS:
+                try:
+                    matrices = dense(problem, CASES[case])
+                    timed[contestant.name] = time_contestant(contestant, matrices, repeats)
+                except Missing as reason:
+                    notes[contestant.name] = f"{contestant.name} is left out: {reason}."
+            rows += [
+                {
+                    "covariance": case,
+                    "runs": runs,
+                    "filter": name,
+                    "us": one.us,
+                    "spread": one.spread,
+                    "first call, s": one.first,
+                }
+                for name, one in timed.items()
+            ]
+    return rows, list(notes.values())
+
+
+def goals(rows: list[dict[str, Any]]) -> list[common.Goal]:
+    """Hold the figures at the larger number of runs against what was promised."""
+    peers = {contestant.name for contestant in CONTESTANTS if contestant.jax}
+    found = []
+    for case, limit in GOALS_US.items():
+        mine = {
+            r["filter"]: r["us"] for r in rows if (r["covariance"], r["runs"]) == (case, RUNS[-1])
+        }
+        fastest = min((us for name, us in mine.items() if name in peers), default=None)
+        ratio = None if fastest is None else fastest / mine["jaxnav"]
+        found.append(common.Goal(f"us, covariance {case}", mine["jaxnav"], limit))
+        text = f"fastest JAX peer / jaxnav, covariance {case}"
+        found.append(common.Goal(text, ratio, GOAL_RATIO, at_least=True))
+    return found
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Run the benchmark and return what it measured."""
+    args = common.arguments(__doc__, argv)
+    common.setup()
+    rows, notes = measure(500 if args.quick else 2000, 3 if args.quick else 7)
+    title = "Microseconds per filter step and model (15 states, 3 measurements, 5 models)"
+    return common.report(args, title, rows, goals(rows), notes)
+
+
+if __name__ == "__main__":
+    main()

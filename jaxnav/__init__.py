@@ -1,0 +1,163 @@
+"""A differentiable filter bank for aided inertial navigation, in JAX.
+
+A filter is a few pure functions, a bank of filters is again a filter, and a study is a ``vmap`` of
+a run. ``jaxnav.estimation`` knows no navigation, ``jaxnav.navigation`` no filters;
+``jaxnav.studies`` joins the two.
+
+Conventions, the same everywhere:
+
+* **Units** are SI and radians; a suffix names any other (``_deg``, ``_arcsec``), at the edges only.
+  ``jaxnav.units`` has the multipliers.
+* **Errors** are computed minus true; sensor errors are measured minus true.
+* **Frames**: i inertial, li launch-inertial (x downrange, y up, z right), e Earth-fixed, n local
+  level (east, north, up), b body. ``C_nb`` takes components in b to components in n; ``w_ib_b`` is
+  the rate of b against i, resolved in b. Misalignment: ``C_computed = (I + [phi]x) C_true``.
+* **Symbols** of the textbooks in kernels: ``x, P, Phi, Q, H, R, K, S, nu``; words elsewhere.
+* **Time**: ``init`` gives the state at t0; step k predicts over [t_{k-1}, t_k], then updates with
+  the observation at t_k. Host time is integer nanoseconds, device time is a step length ``dt`` [s].
+* **Noise** of inertial sensors is given per sample; over a filter period T of samples of length
+  T_imu it adds up to ``G Q0 G' T T_imu``.
+* **Keys** come first. Run i of a Monte Carlo study has the key ``fold_in(key, i)``.
+* **Precision** follows the arrays. The library never touches ``jax.config``; the command line and
+  the studies need 64-bit floats.
+
+References:
+    Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation;
+    Groves (2013), Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems;
+    Titterton and Weston (2004), Strapdown Inertial Navigation Technology.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxnav.estimation.banks.mixture import (
+        BankParams as BankParams,
+    )
+    from jaxnav.estimation.banks.mixture import (
+        bank as bank,
+    )
+    from jaxnav.estimation.banks.mixture import (
+        immae as immae,
+    )
+    from jaxnav.estimation.banks.mixture import (
+        mmae as mmae,
+    )
+    from jaxnav.estimation.banks.mixture import (
+        moment_match as moment_match,
+    )
+    from jaxnav.estimation.banks.mixture import (
+        panel as panel,
+    )
+    from jaxnav.estimation.banks.weights import (
+        WindowedReset as WindowedReset,
+    )
+    from jaxnav.estimation.banks.weights import (
+        bayes as bayes,
+    )
+    from jaxnav.estimation.banks.weights import (
+        chain as chain,
+    )
+    from jaxnav.estimation.banks.weights import (
+        fixed as fixed,
+    )
+    from jaxnav.estimation.banks.weights import (
+        floor as floor,
+    )
+    from jaxnav.estimation.banks.weights import (
+        forget as forget,
+    )
+    from jaxnav.estimation.banks.weights import (
+        markov as markov,
+    )
+    from jaxnav.estimation.banks.weights import (
+        windowed_reset as windowed_reset,
+    )
+    from jaxnav.estimation.bounds import oracle as oracle
+    from jaxnav.estimation.filters.kalman import kf as kf
+    from jaxnav.estimation.filters.square_root import square_root_kf as square_root_kf
+    from jaxnav.estimation.montecarlo import RunOutput as RunOutput
+    from jaxnav.estimation.montecarlo import monte_carlo as monte_carlo
+    from jaxnav.estimation.run import run as run
+    from jaxnav.estimation.run import simulate as simulate
+    from jaxnav.estimation.tune import (
+        fit as fit,
+    )
+    from jaxnav.estimation.tune import (
+        negative_log_likelihood as negative_log_likelihood,
+    )
+    from jaxnav.estimation.types import (
+        Filter as Filter,
+    )
+    from jaxnav.estimation.types import (
+        FilterParams as FilterParams,
+    )
+    from jaxnav.estimation.types import (
+        Gaussian as Gaussian,
+    )
+    from jaxnav.estimation.types import (
+        Info as Info,
+    )
+    from jaxnav.estimation.types import (
+        Model as Model,
+    )
+    from jaxnav.estimation.types import (
+        Obs as Obs,
+    )
+    from jaxnav.estimation.types import (
+        WeightRule as WeightRule,
+    )
+    from jaxnav.estimation.types import (
+        observed as observed,
+    )
+    from jaxnav.estimation.types import (
+        replicate as replicate,
+    )
+
+_HOMES = {
+    "jaxnav.estimation.banks.mixture": (
+        "BankParams",
+        "bank",
+        "immae",
+        "mmae",
+        "moment_match",
+        "panel",
+    ),
+    "jaxnav.estimation.banks.weights": (
+        "WindowedReset",
+        "bayes",
+        "chain",
+        "fixed",
+        "floor",
+        "forget",
+        "markov",
+        "windowed_reset",
+    ),
+    "jaxnav.estimation.bounds": ("oracle",),
+    "jaxnav.estimation.filters.kalman": ("kf",),
+    "jaxnav.estimation.filters.square_root": ("square_root_kf",),
+    "jaxnav.estimation.montecarlo": ("RunOutput", "monte_carlo"),
+    "jaxnav.estimation.run": ("run", "simulate"),
+    "jaxnav.estimation.tune": ("fit", "negative_log_likelihood"),
+    "jaxnav.estimation.types": (
+        "Filter",
+        "FilterParams",
+        "Gaussian",
+        "Info",
+        "Model",
+        "Obs",
+        "WeightRule",
+        "observed",
+        "replicate",
+    ),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = sorted(_HOME_OF)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use, so that ``jaxnav --help`` need not wait for JAX."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'jaxnav' has no attribute {name!r}")
+    return getattr(import_module(_HOME_OF[name]), name)

@@ -25,9 +25,7 @@ def test_fit_finds_the_minimum_of_a_bowl_in_constrained_coordinates() -> None:
     def loss(params: dict[str, jax.Array]) -> jax.Array:
         return (params["a"] - 3.0) ** 2 + (params["b"] - 0.2) ** 2
 
-    found = fit(
-        loss, {"a": 1.0, "b": 0.9}, transform={"a": POSITIVE, "b": UNIT}, steps=400
-    )
+    found = fit(loss, {"a": 1.0, "b": 0.9}, transform={"a": POSITIVE, "b": UNIT}, steps=400)
     assert abs(found.params["a"] - 3.0) < 1e-3
     assert abs(found.params["b"] - 0.2) < 1e-3
     assert found.loss == np.nanmin(found.history)

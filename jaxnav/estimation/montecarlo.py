@@ -66,10 +66,10 @@ def monte_carlo(
 ) -> Campaign:
     """Run a Monte Carlo study; run ``i`` has the key ``fold_in(key, i)`` whatever the tiling.
 
-    A tile is a ``vmap`` over its runs; tiles are spread over the devices and go through one compiled
-    program, which a second call with the same ``run_one`` and shapes uses again. Per-run rows are
-    the same, bit for bit, for any number of devices and any order at the same tile shape, and equal
-    to rounding for other shapes.
+    A tile is a ``vmap`` over its runs; tiles are spread over the devices and go through one
+    compiled program, which a second call with the same ``run_one`` and shapes uses again. Per-run
+    rows are the same, bit for bit, for any number of devices and any order at the same tile shape,
+    and equal to rounding for other shapes.
 
     Args:
         run_one: ``(key, shared) -> RunOutput``; pure.
@@ -102,11 +102,11 @@ def monte_carlo(
     for start in range(0, runs, stride):
         output, finite = _round(run_one, mesh, tile, key, jnp.int32(start), jnp.int32(runs), shared)
         count = min(stride, runs - start)
-        pieces.append(jax.tree.map(lambda leaf: np.asarray(leaf)[:count], (output.row, finite)))
+        pieces.append(_first((output.row, finite), count))
         total = _accumulate(total, output.curve)
         kept = min(max(keep - start, 0), count)
         if kept:
-            traces.append(jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], output.trace))
+            traces.append(_first(output.trace, kept))
         if progress is not None:
             progress(start + count, runs)
     rows, finite = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
@@ -122,10 +122,15 @@ def _even_tile(runs: int, devices: int) -> int:
 
 def _accumulate(total: Any, curve: Any) -> Any:
     """Add the devices' partial sums ``(devices, ...)`` in order, so that the result is fixed."""
-    for part in range(jax.tree.leaves(curve)[0].shape[0] if jax.tree.leaves(curve) else 0):
-        one = jax.tree.map(lambda leaf: np.asarray(leaf)[part], curve)
+    leaves, tree = jax.tree.flatten(curve)
+    for parts in zip(*(np.asarray(leaf) for leaf in leaves), strict=True):
+        one = tree.unflatten(parts)
         total = one if total is None else jax.tree.map(np.add, total, one)
-    return total if total is not None else curve
+    return curve if total is None else total
+
+
+def _first(tree: Any, count: int) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], tree)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

@@ -14,7 +14,7 @@ Recorder = Callable[[Any, Any], Any]
 
 
 class Trace(NamedTuple):
-    """What a run returns: ``record``'s pytree with a leading time axis, and the state at the end."""
+    """What a run returns: ``record``'s pytree with a leading time axis, and the last state."""
 
     record: Any
     final: Any

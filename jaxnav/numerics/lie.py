@@ -14,7 +14,7 @@ def _taylor_angle(dtype: jnp.dtype) -> float:
 
 
 def skew(v: Array) -> Array:
-    """Return the cross-product matrix ``[v]x`` ``(3, 3)``, so that ``skew(v) @ w == cross(v, w)``."""
+    """Return the cross-product matrix ``[v]x`` ``(3, 3)``: ``skew(v) @ w == cross(v, w)``."""
     zero = jnp.zeros((), v.dtype)
     return jnp.stack(
         [
@@ -42,7 +42,7 @@ def _exp_coefficients(squared: Array) -> tuple[Array, Array, Array]:
 def so3_exp(phi: Array) -> Array:
     """Return the rotation matrix ``(3, 3)`` of the rotation vector ``phi`` ``(3,) [rad]``.
 
-    ``exp([phi]x) = I + sin(a)/a [phi]x + (1 - cos(a))/a^2 [phi]x^2`` with ``a = |phi|`` (Rodrigues).
+    ``exp([phi]x) = I + sin(a)/a [phi]x + (1 - cos(a))/a^2 [phi]x^2``, ``a = |phi|`` (Rodrigues).
     """
     sinc, half, _ = _exp_coefficients(jnp.sum(phi * phi))
     K = skew(phi)
@@ -100,8 +100,8 @@ def _largest_component_quaternion(C: Array) -> Array:
 def dcm_from_euler(pitch: Array, yaw: Array, roll: Array) -> Array:
     """Return ``C_ib`` ``(3, 3)`` for pitch about z, then yaw about y, then roll about x [rad].
 
-    ``C_ib = Rz(pitch) Ry(yaw) Rx(roll)``: with x downrange, y up and z right, a vertical vehicle has
-    pitch pi/2 and the sequence is regular there; it is singular at a yaw of +-pi/2.
+    ``C_ib = Rz(pitch) Ry(yaw) Rx(roll)``: with x downrange, y up and z right, a vertical vehicle
+    has pitch pi/2 and the sequence is regular there; it is singular at a yaw of +-pi/2.
 
     References:
         Zhao, Chen, He, Ge (2018), IEEE/CAA JAS 5(6), the sequence of Eq. (35).

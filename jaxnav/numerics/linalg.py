@@ -103,7 +103,7 @@ def _dot(a: list[Array], b: list[Array]) -> Array | int:
 
 
 def solve_lower(L: Array, B: Array) -> Array:
-    """Return ``inv(L) B`` by forward substitution; ``L`` ``(m, m)``, ``B`` ``(m, n)`` or ``(m,)``."""
+    """Return ``inv(L) B`` by substitution; lower ``L`` ``(m, m)``, ``B`` ``(m, n)`` or ``(m,)``."""
     m = L.shape[0]
     if m > UNROLL_LIMIT:
         return jax.scipy.linalg.solve_triangular(L, B, lower=True)
@@ -130,10 +130,10 @@ def log_det(L: Array) -> Array:
 
 
 def tria(A: Array) -> Array:
-    """Return the lower-triangular ``L`` ``(n, n)`` with ``L L' = A A'`` for a wide ``A`` ``(n, k)``.
+    """Return the lower-triangular ``L`` ``(n, n)`` with ``L L' = A A'`` for wide ``A`` ``(n, k)``.
 
-    The diagonal is non-negative, which makes the factor unique for a full-rank ``A``. Uses QR, whose
-    derivative exists when ``A`` has full row rank and ``k >= n``.
+    The diagonal is non-negative, which makes the factor unique for a full-rank ``A``. Uses QR,
+    whose derivative exists when ``A`` has full row rank and ``k >= n``.
     """
     R = jnp.linalg.qr(A.T, mode="r")
     signs = jnp.where(jnp.diag(R) < 0, -1, 1).astype(A.dtype)

@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Linear(NamedTuple):
-    """A linear model: per-step ``Phi`` (T, n, n), ``Q`` (T, n, n), and ``H``, ``R``, ``x0``, ``P0``."""
+    """A linear model: ``Phi`` and ``Q`` (T, n, n) per step, and constant ``H, R, x0, P0``."""
 
     Phi: np.ndarray
     Q: np.ndarray

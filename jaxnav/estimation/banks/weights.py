@@ -122,9 +122,9 @@ def forget() -> WeightRule:
 def markov() -> WeightRule:
     """Return Markov switching between models; the parameter is the probability to switch per step.
 
-    Before the data, ``w_i = (1 - p) w_i + p (1 - w_i) / (M - 1)``: the model index is a Markov chain
-    that leaves its state with probability ``p`` for any other one. The members do not interact; the
-    rule is the weight recursion of an interacting bank without its mixing step.
+    Before the data, ``w_i = (1 - p) w_i + p (1 - w_i) / (M - 1)``: the model index is a Markov
+    chain that leaves its state with probability ``p`` for any other one. The members do not
+    interact; the rule is the weight recursion of an interacting bank without its mixing step.
     """
 
     def predict(params: Array, state: Any, log_weights: Array, k: Array) -> Array:

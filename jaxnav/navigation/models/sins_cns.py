@@ -1,7 +1,7 @@
 """Error model of a strapdown inertial system aided by a star tracker, launch-inertial frame.
 
-Fifteen states: misalignment phi, velocity error dv, position error dr (all in inertial axes, computed
-minus true), gyro drift eps and accelerometer bias nabla (body axes, measured minus true):
+Fifteen states: misalignment phi, velocity error dv, position error dr (all in inertial axes,
+computed minus true), gyro drift eps and accelerometer bias nabla (body axes, measured minus true):
 
     phi' = C eps,   dv' = -[f]x phi + F_a dr + C nabla,   dr' = dv,   eps' = nabla' = 0
 
@@ -83,8 +83,8 @@ def inputs_from_solution(
 ) -> SinsCnsInput:
     """Return the model's inputs ``(K, ...)`` from a mechanised solution.
 
-    The attitude of a step is the one half-way, by averaging its ends; the specific force is the mean
-    over the period.
+    The attitude of a step is the one half-way, by averaging its ends; the specific force is the
+    mean over the period.
 
     Args:
         start: Navigation state at t0.

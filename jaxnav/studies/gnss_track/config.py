@@ -54,9 +54,7 @@ class GnssTrackConfig:
             self, "thin_period_s", "position_sigma", "initial_speed_sigma", "reset_period_s"
         )
         require_positive(self, "q")
-        require(
-            0 < self.reset_threshold <= 1, "reset_threshold", self.reset_threshold, "in (0, 1]"
-        )
+        require(0 < self.reset_threshold <= 1, "reset_threshold", self.reset_threshold, "in (0, 1]")
         require(
             0 < self.weight_floor < 1 / len(self.q),
             "weight_floor",

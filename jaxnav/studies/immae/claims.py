@@ -44,9 +44,7 @@ def assess(config: ImmaeConfig, campaign: Campaign) -> list[Claim]:
     """
     published = PUBLISHED[config.scenario]["methods"]
     rivals = [name for name in ("kf", "mmae") if name in published]
-    claims = [
-        _improvement(campaign, rival, axis, published) for rival in rivals for axis in AXES
-    ]
+    claims = [_improvement(campaign, rival, axis, published) for rival in rivals for axis in AXES]
     claims += [_level(campaign, axis, published["immae"][axis]) for axis in AXES]
     if config.scenario == "matched-noise":
         claims.append(_first_model_chosen(config, campaign))
@@ -76,8 +74,7 @@ def _improvement(
     )
     return Claim(
         id=f"immae-beats-{rival}-{axis}",
-        text=f"IMMAE lowers the RMSE of the {axis} angle against {rival.upper()} "
-        f"by {-printed:.1%}",
+        text=f"IMMAE lowers the RMSE of the {axis} angle against {rival.upper()} by {-printed:.1%}",
         published=printed,
         measured=ratio.value - 1,
         ci95=(ratio.low - 1, ratio.high - 1),

@@ -1,0 +1,153 @@
+"""The order of dependence: a module imports only from the layers below it."""
+
+import ast
+from pathlib import Path
+
+import jaxnav
+
+ROOT = Path(jaxnav.__file__).parent
+
+# From the ground up; a module may import from layers before its own and from its own folder's rank.
+ORDER = (
+    "units",
+    "numerics.linalg",
+    "numerics.lie",
+    "numerics.ode",
+    "estimation.types",
+    "estimation.filters.kalman",
+    "estimation.filters.square_root",
+    "estimation.banks.weights",
+    "estimation.banks.mixture",
+    "estimation.run",
+    "estimation.montecarlo",
+    "estimation.metrics",
+    "estimation.bounds",
+    "estimation.tune",
+    "estimation",
+    "navigation.earth",
+    "navigation.strapdown",
+    "navigation.trajectory.rocket",
+    "navigation.sensors.imu",
+    "navigation.sensors.star",
+    "navigation.models.kinematic",
+    "navigation.models.sins_cns",
+    "datasets",
+    "studies.base",
+    "studies",
+    "plotting",
+    "studies.immae.config",
+    "studies.immae.simulation",
+    "studies.immae.methods",
+    "studies.immae.claims",
+    "studies.immae.study",
+    "studies.immae.figures",
+    "studies.gnss_track.config",
+    "studies.gnss_track.study",
+    "studies.gnss_track.figures",
+    "results",
+    "options",
+    "report",
+    "cli",
+    "__main__",
+)
+EDGES = {"matplotlib", "rich", "tyro"}
+EDGE_MODULES = {"plotting", "report", "options"}
+
+
+def modules() -> dict[str, Path]:
+    """Every module with code, by its dotted name below jaxnav."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        if name != "__init__":
+            found[name] = path
+    return found
+
+
+def imports(path: Path) -> set[str]:
+    """The modules a file imports, wherever in the file."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module}
+            if node.module.startswith("jaxnav"):
+                below = {f"{node.module}.{alias.name}" for alias in node.names}
+                names |= {name for name in below if name.removeprefix("jaxnav.") in modules()}
+    return names
+
+
+def inside(path: Path) -> set[str]:
+    return {name.removeprefix("jaxnav.") for name in imports(path) if name.startswith("jaxnav.")}
+
+
+def only_documents(path: Path) -> bool:
+    return len(ast.parse(path.read_text()).body) <= 1
+
+
+def test_every_module_has_its_place() -> None:
+    with_code = {name for name, path in modules().items() if not only_documents(path)}
+    assert with_code == set(ORDER)
+
+
+def test_modules_import_only_from_below() -> None:
+    for name, path in modules().items():
+        if name not in ORDER:
+            continue
+        allowed = set(ORDER[: ORDER.index(name)])
+        packages = {other for other in modules() if other not in ORDER}
+        late = inside(path) - allowed - packages
+        # the catalogue names what the package holds, the registry loads its studies by name
+        assert not late, f"{name} imports {sorted(late)}"
+
+
+def test_the_wings_meet_in_the_types_alone() -> None:
+    for name, path in modules().items():
+        seen = inside(path)
+        if name.startswith("estimation"):
+            assert not {other for other in seen if other.startswith("navigation")}, name
+        if name.startswith("navigation"):
+            crossing = {other for other in seen if other.startswith("estimation.")}
+            allowed = {"estimation.types"} if name.startswith("navigation.models") else set()
+            assert crossing <= allowed, name
+
+
+def test_only_the_edges_touch_the_outside() -> None:
+    for name, path in modules().items():
+        outside = {other.split(".")[0] for other in imports(path)}
+        if name not in EDGE_MODULES:
+            assert not outside & EDGES, f"{name} imports {outside & EDGES}"
+
+
+def test_jit_appears_where_time_or_runs_are_driven() -> None:
+    drivers = (
+        "estimation.run",
+        "estimation.montecarlo",
+        "estimation.tune",
+        "navigation.trajectory",
+    )
+    for name, path in modules().items():
+        if name.startswith(("numerics", "estimation", "navigation")) and not name.startswith(
+            drivers
+        ):
+            assert "jax.jit" not in path.read_text(), name
+
+
+def test_the_library_leaves_the_configuration_of_jax_alone() -> None:
+    for name, path in modules().items():
+        if name != "cli":
+            assert "jax.config.update(" not in path.read_text().replace(
+                "(jax.config.update(", ""
+            ), name
+
+
+def test_public_names_exist_and_are_about_thirty() -> None:
+    assert 20 <= len(jaxnav.__all__) <= 40
+    for name in jaxnav.__all__:
+        assert getattr(jaxnav, name) is not None
+
+
+def test_files_stay_within_four_hundred_lines() -> None:
+    for name, path in modules().items():
+        assert len(path.read_text().splitlines()) <= 400, name
