@@ -60,7 +60,7 @@ def monte_carlo(
     shared: Any = (),
     *,
     tile: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     keep: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Campaign:
