@@ -164,7 +164,7 @@ def print_doctor() -> None:
     table = Table(title="jaxnav doctor", show_header=False)
     for name, value in provenance().items():
         table.add_row(name, ", ".join(value) if isinstance(value, list) else str(value))
-    table.add_row("compilation cache", str(jax.config.read("jax_compilation_cache_dir") or "off"))
+    table.add_row("compilation cache", str(jax.config.values["jax_compilation_cache_dir"] or "off"))
     table.add_row("peers for benchmarks", _peers())
     console.print(table)
 

@@ -45,7 +45,7 @@ def provenance() -> dict[str, Any]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "devices": [str(device) for device in jax.local_devices()],
-        "x64": bool(jax.config.read("jax_enable_x64")),
+        "x64": jax.numpy.result_type(float) == "float64",
     }
 
 

@@ -75,12 +75,12 @@ def test_vectors_and_the_sizes_around_the_limit():
 
     products, lower, upper = calculated(pairs, factors)
     for (A, B), (matrix, vector) in zip(pairs, products, strict=True):
-        np.testing.assert_allclose(matrix, A @ B, atol=1e-14)
-        np.testing.assert_allclose(vector, A @ B[:, 0], atol=1e-14)
+        np.testing.assert_allclose(matrix, A @ B, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(vector, A @ B[:, 0], rtol=0, atol=1e-14)
     for L, y, x in zip(factors, lower, upper, strict=True):
         b = np.arange(1.0, L.shape[0] + 1)
-        np.testing.assert_allclose(L @ y, b, atol=1e-13)
-        np.testing.assert_allclose(L.T @ x, b, atol=1e-13)
+        np.testing.assert_allclose(L @ y, b, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(L.T @ x, b, rtol=0, atol=1e-13)
 
 
 def test_float32_stays_float32():
@@ -197,9 +197,9 @@ def test_root_of_a_singular_matrix():
 
     L, gradient = map(np.asarray, root_and_gradient(A))
     np.testing.assert_array_equal(L, np.tril(L))
-    np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, atol=1e-14)
-    np.testing.assert_array_equal(L[1], np.sqrt(A[1]))
-    np.testing.assert_allclose(L[6], np.linalg.cholesky(A[6]), atol=1e-13)
+    np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(L[1], np.sqrt(A[1]), rtol=1e-14)
+    np.testing.assert_allclose(L[6], np.linalg.cholesky(A[6]), rtol=0, atol=1e-13)
     assert np.all(np.isfinite(gradient))
 
 
@@ -208,7 +208,7 @@ def test_root_of_a_matrix_that_is_singular_to_rounding():
     axes = np.linalg.qr(rng.standard_normal((50_000, 3, 3)))[0]
     A = (axes * np.array([1.0, 1.0, 0.0])) @ axes.transpose(0, 2, 1)
     L = np.asarray(jax.jit(jax.vmap(linalg.semidefinite_root))(A))
-    np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-13)
 
 
 def test_gradient_of_safe_norm_at_zero_and_beyond():

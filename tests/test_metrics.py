@@ -55,7 +55,7 @@ def test_interval_of_a_mean_of_few_values_covers_the_truth():
     widths = [(r.high - r.value) / np.std(v, ddof=1) for r, v in zip(results, values, strict=True)]
     np.testing.assert_allclose(widths, 3.182446305284263 / 2, rtol=1e-12)
     np.testing.assert_allclose(
-        [r.value - r.low for r in results], [r.high - r.value for r in results]
+        [r.value - r.low for r in results], [r.high - r.value for r in results], rtol=1e-12
     )
 
 

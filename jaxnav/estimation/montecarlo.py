@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 TILE = 16
 """Largest number of runs in a tile by default: the working set of a bank of seven 15-state filters
@@ -66,8 +66,8 @@ def monte_carlo(
 ) -> Campaign:
     """Run a Monte Carlo study; run ``i`` has the key ``fold_in(key, i)`` whatever the tiling.
 
-    A tile is a ``vmap`` over its runs; tiles are spread over the devices and go through one
-    compiled program, which a second call with the same ``run_one`` and shapes uses again. Per-run
+    A tile is a ``vmap`` over its runs; the devices compute tiles side by side with the same
+    program, which a second call with the same ``run_one`` and shapes uses again. Per-run
     rows are the same, bit for bit, for any number of devices and any order at the same tile shape,
     and equal to rounding for other shapes.
 
@@ -94,21 +94,30 @@ def monte_carlo(
         tile = _even_tile(runs, len(chosen))
     if tile < 1:
         raise ValueError(f"tile is {tile}; it needs at least 1 run")
-    mesh = Mesh(np.array(chosen), ("tiles",))
     stride = tile * len(chosen)
+    inputs = [jax.device_put((key, jnp.int32(runs), shared), device) for device in chosen]
     pieces: list[tuple[Any, np.ndarray]] = []
     total: Any = None
     traces: list[Any] = []
-    for start in range(0, runs, stride):
-        output, finite = _round(run_one, mesh, tile, key, jnp.int32(start), jnp.int32(runs), shared)
-        count = min(stride, runs - start)
-        pieces.append(_first((output.row, finite), count))
-        total = _accumulate(total, output.curve)
-        kept = min(max(keep - start, 0), count)
-        if kept:
-            traces.append(_first(output.trace, kept))
-        if progress is not None:
-            progress(start + count, runs)
+
+    def compute(start: int, place: int) -> tuple[RunOutput, Array]:
+        return jax.block_until_ready(
+            _run_tile(run_one, tile, np.int32(start + place * tile), *inputs[place])
+        )
+
+    with ThreadPoolExecutor(len(chosen)) as pool:
+        for start in range(0, runs, stride):
+            results = list(pool.map(partial(compute, start), range(len(chosen))))
+            for place, (output, finite) in enumerate(results):
+                first = start + place * tile
+                count = min(max(runs - first, 0), tile)
+                kept = min(max(keep - first, 0), count)
+                pieces.append(_first((output.row, finite), count))
+                total = _add(total, output.curve)
+                if kept:
+                    traces.append(_first(output.trace, kept))
+            if progress is not None:
+                progress(min(start + stride, runs), runs)
     rows, finite = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *traces) if traces else ()
     return Campaign(rows, total, joined, finite)
@@ -120,55 +129,42 @@ def _even_tile(runs: int, devices: int) -> int:
     return math.ceil(runs / (devices * rounds))
 
 
-def _accumulate(total: Any, curve: Any) -> Any:
-    """Add the devices' partial sums ``(devices, ...)`` in order, so that the result is fixed."""
-    leaves, tree = jax.tree.flatten(curve)
-    for parts in zip(*(np.asarray(leaf) for leaf in leaves), strict=True):
-        one = tree.unflatten(parts)
-        total = one if total is None else jax.tree.map(np.add, total, one)
-    return curve if total is None else total
+def _add(total: Any, curve: Any) -> Any:
+    """Add a tile's sum on the host, in the order of the runs, so that the result is fixed."""
+    if total is None:
+        return jax.tree.map(np.asarray, curve)
+    return jax.tree.map(lambda a, b: a + np.asarray(b), total, curve)
 
 
 def _first(tree: Any, count: int) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], tree)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _round(
+@partial(jax.jit, static_argnums=(0, 1))
+def _run_tile(
     run_one: Callable[[Array, Any], RunOutput],
-    mesh: Mesh,
     tile: int,
-    key: Array,
     start: Array,
+    key: Array,
     runs: Array,
     shared: Any,
 ) -> tuple[RunOutput, Array]:
-    """Compute one tile on each device; what each computes does not depend on the others."""
-    spread, whole = PartitionSpec("tiles"), PartitionSpec()
+    """Compute the tile of runs from ``start``; every device runs this same program.
 
-    def one_tile(indices: Array, key: Array, runs: Array, shared: Any) -> tuple[RunOutput, Array]:
-        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
-        output = jax.vmap(run_one, in_axes=(0, None))(keys, shared)
-        finite = jax.vmap(_all_finite)(output.row)
-        counted = finite & (indices < runs)
+    One program split over the devices (``shard_map``) is compiled differently for one device and
+    for two, and its results differ in the last bits.
+    """
+    indices = start + jnp.arange(tile, dtype=jnp.int32)
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
+    output = jax.vmap(run_one, in_axes=(0, None))(keys, shared)
+    finite = jax.vmap(_all_finite)(output.row)
+    counted = finite & (indices < runs)
 
-        def add_up(leaf: Array) -> Array:
-            mask = counted.reshape(-1, *([1] * (leaf.ndim - 1)))
-            return jnp.sum(jnp.where(mask, leaf, 0), axis=0, keepdims=True)
+    def add_up(leaf: Array) -> Array:
+        mask = counted.reshape(-1, *([1] * (leaf.ndim - 1)))
+        return jnp.sum(jnp.where(mask, leaf, 0), axis=0)
 
-        return output._replace(curve=jax.tree.map(add_up, output.curve)), finite
-
-    # The runs' carries start as constants: without this flag shard_map calls them replicated.
-    mapped = jax.shard_map(
-        one_tile,
-        mesh=mesh,
-        in_specs=(spread, whole, whole, whole),
-        out_specs=spread,
-        check_vma=False,
-    )
-    indices = start + jnp.arange(tile * mesh.size, dtype=jnp.int32)
-    indices = jax.lax.with_sharding_constraint(indices, NamedSharding(mesh, spread))
-    return mapped(indices, key, runs, shared)
+    return output._replace(curve=jax.tree.map(add_up, output.curve)), finite
 
 
 def _all_finite(row: Any) -> Array:

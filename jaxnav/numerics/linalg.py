@@ -52,7 +52,7 @@ class Cholesky(NamedTuple):
     """Lower Cholesky factor ``L L' = S`` with the health of the factorisation.
 
     Attributes:
-        factor: ``(m, m)`` lower factor; a finite stand-in where ``S`` is not positive definite.
+        factor: ``(m, m)`` lower factor; the identity where ``S`` is not positive definite.
         positive_definite: Whether every pivot was positive.
         reciprocal_pivot: Smallest ratio of a pivot to its diagonal entry: 1 for a diagonal matrix,
             about the machine epsilon when the factor has lost all its digits.
@@ -66,8 +66,8 @@ class Cholesky(NamedTuple):
 def cholesky(S: Array) -> Cholesky:
     """Factor a symmetric matrix ``(m, m)``; a failed factorisation is reported, never NaN.
 
-    The factor of an indefinite matrix is finite and differentiable (non-positive pivots are
-    replaced by one before the root), so a caller can select against it without poisoning gradients.
+    Only the lower triangle is read. Non-positive pivots are replaced by one before the root, so a
+    caller can select against a failed factor without poisoning gradients.
     """
     m = S.shape[0]
     if m > UNROLL_LIMIT:
@@ -87,7 +87,7 @@ def cholesky(S: Array) -> Cholesky:
         L.append(row)
     zero = jnp.zeros((), S.dtype)
     factor = jnp.stack([jnp.stack(row + [zero] * (m - len(row))) for row in L])
-    return Cholesky(factor, positive, ratio)
+    return Cholesky(jnp.where(positive, factor, jnp.eye(m, dtype=S.dtype)), positive, ratio)
 
 
 def _lapack_cholesky(S: Array) -> Cholesky:
@@ -144,9 +144,12 @@ def semidefinite_root(A: Array) -> Array:
     """Return a lower ``L`` ``(n, n)`` with ``L L' = A`` for a positive semi-definite ``A``.
 
     Columns whose pivot is not positive are zero, so covariances with states that carry no noise are
-    factored exactly; the gradient with respect to such a zero pivot is zero.
+    factored; the gradient with respect to such a zero pivot is zero. The diagonal is raised by
+    ``2 n`` rounding errors first: without that, a matrix that is singular to rounding loses its
+    digits in the elimination (2e-3 relative at n = 15).
     """
     n = A.shape[0]
+    A = A + 2 * n * jnp.finfo(A.dtype).eps * jnp.diag(jnp.diag(A))
     rows = jnp.arange(n)
     columns: list[Array] = []
     for j in range(n):

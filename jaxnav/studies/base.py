@@ -41,7 +41,7 @@ def require_x64() -> None:
     import jax
 
     require(
-        jax.config.read("jax_enable_x64"),
+        jax.numpy.result_type(float) == "float64",
         "jax_enable_x64",
         False,
         "True before a study runs (jax.config.update('jax_enable_x64', True) or JAX_ENABLE_X64=1)",

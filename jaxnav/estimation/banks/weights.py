@@ -17,8 +17,18 @@ from jaxnav.estimation.types import Info, WeightRule
 
 def normalise(log_weights: Array) -> Array:
     """Return log-weights ``(M,)`` whose weights sum to one; all ``-inf`` stays as it is."""
-    total = jax.nn.logsumexp(log_weights)
-    return log_weights - jnp.where(jnp.isfinite(total), total, 0)
+    shifted = from_peak(log_weights)
+    total = jax.nn.logsumexp(shifted)
+    return shifted - jnp.where(jnp.isfinite(total), total, 0)
+
+
+def from_peak(values: Array) -> Array:
+    """Return log-values ``(M,)`` less their largest, which rounds nothing that matters.
+
+    A sum of weights taken at the level of log-likelihoods of -1e6 would be right to 1e-10 only.
+    """
+    peak = jax.lax.stop_gradient(jnp.max(values))
+    return values - jnp.where(jnp.isfinite(peak), peak, 0)
 
 
 def active(log_weights: Array) -> Array:
@@ -60,7 +70,9 @@ def fixed() -> WeightRule:
 
 
 def _bayes_step(log_weights: Array, info: Info) -> Array:
-    posterior = log_weights + member_log_likelihood(info.log_likelihood)
+    members = active(log_weights)
+    likelihood = jnp.where(members, member_log_likelihood(info.log_likelihood), -jnp.inf)
+    posterior = log_weights + from_peak(likelihood)
     vetoed = ~jnp.any(active(posterior))
     return normalise(jnp.where(vetoed, log_weights, posterior))
 

@@ -18,7 +18,12 @@ from jaxnav.navigation.models.sins_cns import (
 )
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
 from jaxnav.navigation.sensors.star import observe_attitude
-from jaxnav.navigation.strapdown import NavSolution, NavState, mechanise_launch_inertial
+from jaxnav.navigation.strapdown import (
+    NavSolution,
+    NavState,
+    mechanise_launch_inertial,
+    rotation_compensated,
+)
 from jaxnav.navigation.trajectory.rocket import RocketProfile, Trajectory, fly
 from jaxnav.numerics.lie import euler_error_from_rotation, so3_exp
 from jaxnav.numerics.linalg import matmul
@@ -148,8 +153,9 @@ def _nominal_inputs(
 ) -> SinsCnsInput:
     start = jax.tree.map(lambda leaf: leaf[0], trajectory.state)
     every = config.samples_per_step
-    force = jax.vmap(matmul)(trajectory.state.dcm[:-1], trajectory.dvel)
-    gained = jnp.sum(force.reshape(-1, every, 3), axis=1)
+    turned = jax.vmap(rotation_compensated)(trajectory.dtheta, trajectory.dvel)
+    specific = jax.vmap(matmul)(trajectory.state.dcm[:-1], turned)
+    gained = jnp.sum(specific.reshape(-1, every, 3), axis=1)
     return inputs_from_solution(
         start, NavSolution(epochs, gained), config.filter_period_s, radius, scale
     )

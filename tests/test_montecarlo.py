@@ -1,0 +1,101 @@
+"""Monte Carlo: the same run whatever the tiling, devices and order; memory; failures as data."""
+
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.estimation.montecarlo import Campaign, RunOutput, monte_carlo
+from jaxnav.studies.immae.config import ImmaeConfig
+from jaxnav.studies.immae.study import run_campaign
+
+
+def test_tiles_and_devices_do_not_change_a_run() -> None:
+    config = ImmaeConfig(chain="linear", runs=16, duration_s=20.0)
+    one, two = jax.local_devices()[:1], jax.local_devices()[:2]
+    assert len(two) == 2
+
+    def campaign(tile: int, devices: list[jax.Device]) -> Campaign:
+        return run_campaign(config, tile=tile, devices=devices, keep=1)
+
+    reference = campaign(16, one)
+    for tile in (1, 7, 16):
+        narrow, wide = campaign(tile, one), campaign(tile, two)
+        for a, b in zip(jax.tree.leaves(narrow.rows), jax.tree.leaves(wide.rows), strict=True):
+            np.testing.assert_array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(narrow.rows), jax.tree.leaves(reference.rows), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+        for a, b in zip(
+            jax.tree.leaves(narrow.curve), jax.tree.leaves(reference.curve), strict=True
+        ):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-18)
+
+
+def _noisy(key: jax.Array, shared: jax.Array) -> RunOutput:
+    x = shared + jax.random.normal(key, (5,))
+    bad = x[0] > 1.5
+    return RunOutput(row=jnp.where(bad, jnp.nan, x), curve=x, trace=x)
+
+
+def test_a_run_is_a_function_of_its_index() -> None:
+    key = jax.random.key(3)
+    few = monte_carlo(_noisy, key, 10, jnp.zeros(()), tile=4, keep=3)
+    many = monte_carlo(_noisy, key, 23, jnp.zeros(()), tile=5, keep=3)
+    np.testing.assert_array_equal(few.rows, many.rows[:10])
+    np.testing.assert_array_equal(few.traces, many.traces)
+    alone = _noisy(jax.random.fold_in(key, 7), jnp.zeros(()))
+    np.testing.assert_array_equal(alone.row, many.rows[7])
+
+
+def test_a_failed_run_is_kept_as_a_row_and_left_out_of_the_sum() -> None:
+    campaign = monte_carlo(_noisy, jax.random.key(0), 60, jnp.zeros(()), tile=8)
+    failed = np.isnan(campaign.rows).any(axis=1)
+    assert 0 < failed.sum() < 60
+    np.testing.assert_array_equal(campaign.finite, ~failed)
+    np.testing.assert_allclose(campaign.mean_curve, campaign.rows[~failed].mean(axis=0))
+
+
+def test_progress_counts_runs() -> None:
+    seen: list[tuple[int, int]] = []
+    monte_carlo(
+        _noisy,
+        jax.random.key(0),
+        11,
+        jnp.zeros(()),
+        tile=2,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert seen == [(4, 11), (8, 11), (11, 11)]
+
+
+@pytest.mark.parametrize(("runs", "tile"), [(0, None), (-3, None), (4, 0)])
+def test_numbers_that_are_not_positive_are_refused(runs: int, tile: int | None) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        monte_carlo(_noisy, jax.random.key(0), runs, jnp.zeros(()), tile=tile)
+
+
+@pytest.mark.slow
+def test_ten_thousand_runs_of_the_linear_chain_hold_in_memory() -> None:
+    script = """
+        import resource
+        import jax
+        jax.config.update("jax_enable_x64", True)
+        jax.config.update("jax_num_cpu_devices", 2)
+        from jaxnav.studies.immae.config import ImmaeConfig
+        from jaxnav.studies.immae.study import run_campaign
+        campaign = run_campaign(ImmaeConfig(chain="linear", runs=10_000))
+        assert campaign.finite.all()
+        assert campaign.rows.mean_square.shape == (10_000, 6, 3)
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert int(done.stdout) < 2.5 * 2**30

@@ -1,0 +1,165 @@
+"""Weight rules at the edges: underflow, vetoes, padding, and what the smooth reset keeps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.estimation.banks.mixture import mixture_info, moment_match
+from jaxnav.estimation.banks.weights import (
+    WindowedReset,
+    bayes,
+    chain,
+    fixed,
+    floor,
+    forget,
+    markov,
+    normalise,
+    uniform,
+    windowed_reset,
+)
+from jaxnav.estimation.types import Flag, Gaussian, Info, WeightRule
+
+MODELS = 3
+RESET = WindowedReset(jnp.array(20.0), jnp.array(0.9), jnp.array(0.05))
+RULES: dict[str, tuple[WeightRule, tuple]] = {
+    "bayes": (chain(bayes()), ((),)),
+    "floor": (chain(bayes(), floor()), ((), jnp.array(1e-6))),
+    "forget": (chain(forget(), bayes()), (jnp.array(0.98), ())),
+    "markov": (chain(markov(), bayes()), (jnp.array(1e-3), ())),
+    "reset": (chain(bayes(), windowed_reset()), ((), RESET)),
+    "smooth reset": (chain(bayes(), windowed_reset(smooth=True)), ((), RESET)),
+}
+each_rule = pytest.mark.parametrize("name", RULES)
+
+
+def info_of(log_likelihood: jax.Array) -> Info:
+    """The part of a bank's info that the rules read."""
+    zero = jnp.zeros(log_likelihood.shape[0])
+    flags = jnp.zeros(log_likelihood.shape[0], jnp.int32)
+    return Info(zero[:, None], jnp.ones((zero.size, 1, 1)), log_likelihood, zero, flags, flags)
+
+
+def weigh(
+    name: str, rows: jax.Array, prior: jax.Array | None = None, params: tuple | None = None
+) -> jax.Array:
+    """Log-weights (T, M) of a rule over log-likelihoods (T, M)."""
+    rule, own = RULES[name]
+    own = own if params is None else params
+    start = normalise(jnp.zeros(rows.shape[1]) if prior is None else prior)
+
+    def step(carry: tuple, row: jax.Array) -> tuple[tuple, jax.Array]:
+        memory, log_weights, k = carry
+        log_weights = rule.predict(own, memory, log_weights, k)
+        memory, log_weights = rule.update(own, memory, log_weights, info_of(row), k)
+        return (memory, log_weights, k + 1), log_weights
+
+    first = (rule.init(own, start), start, jnp.int32(1))
+    return jax.jit(lambda rows: jax.lax.scan(step, first, rows)[1])(rows)
+
+
+@each_rule
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_weights_sum_to_one_through_underflow(name: str, dtype: jnp.dtype) -> None:
+    """One step in which every likelihood underflows, and 10,000 steps with a wrong model."""
+    rows = jnp.broadcast_to(jnp.array([-1.0, -1.5, -9.0]), (10_000, MODELS))
+    rows = rows.at[5].set(-5e5).astype(dtype)
+    params = jax.tree.map(lambda leaf: leaf.astype(dtype), RULES[name][1])
+    start = normalise(jnp.zeros(MODELS, dtype))
+    w = np.exp(np.asarray(weigh(name, rows, start, params), np.float64))
+    assert np.all(np.isfinite(w))
+    assert np.abs(w.sum(axis=1) - 1).max() <= 4 * MODELS * np.finfo(dtype).eps
+    assert w[-1].argmax() == 0
+
+
+@each_rule
+def test_members_alike_keep_equal_weights(name: str) -> None:
+    rng = np.random.default_rng(0)
+    rows = jnp.array(np.repeat(rng.normal(size=(500, 1)), MODELS, axis=1))
+    np.testing.assert_allclose(np.exp(weigh(name, rows)), 1 / MODELS, atol=1e-12)
+
+
+@each_rule
+def test_padding_changes_nothing_and_stays_out(name: str) -> None:
+    rng = np.random.default_rng(1)
+    rows = jnp.array(rng.normal(size=(300, MODELS)))
+    padded = jnp.concatenate([rows, 100 + rows[:, :2]], axis=1)
+    prior = jnp.array([0.0, 0.0, 0.0, -jnp.inf, -jnp.inf])
+    plain, wide = weigh(name, rows), weigh(name, padded, prior)
+    np.testing.assert_allclose(wide[:, :MODELS], plain, atol=1e-12)
+    assert np.all(np.isneginf(wide[:, MODELS:]))
+
+
+@each_rule
+@pytest.mark.parametrize("veto", [-jnp.inf, jnp.nan])
+def test_veto_of_all_keeps_weights_and_of_one_drops_it(name: str, veto: float) -> None:
+    rows = jnp.zeros((6, MODELS)).at[2].set(veto)
+    np.testing.assert_allclose(np.exp(weigh(name, rows)), 1 / MODELS, atol=1e-12)
+    dropped = np.exp(weigh(name, jnp.zeros((6, MODELS)).at[2, 1].set(veto)))
+    np.testing.assert_array_equal(dropped[2:, 1], 0)
+    np.testing.assert_allclose(dropped[2:, [0, 2]], 0.5, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["floor", "markov", "reset"])
+def test_a_model_that_was_ruled_out_comes_back(name: str) -> None:
+    """After 2000 steps against it, a model that turns right leads within two windows."""
+    wrong = jnp.broadcast_to(jnp.array([0.0, -2.0, -8.0]), (2000, MODELS))
+    right = jnp.broadcast_to(jnp.array([-2.0, 0.0, -8.0]), (40, MODELS))
+    log_weights = weigh(name, jnp.concatenate([wrong, right]))
+    assert log_weights[-1].argmax() == 1
+    assert weigh("bayes", jnp.concatenate([wrong, right]))[-1].argmax() == 0
+
+
+def test_windows_that_agree_never_reset() -> None:
+    rng = np.random.default_rng(2)
+    rows = jnp.array([[0.0, -1.5, -4.0]]) + jnp.array(0.1 * rng.normal(size=(400, MODELS)))
+    np.testing.assert_allclose(weigh("reset", rows), weigh("bayes", rows), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["floor", "forget", "markov", "smooth reset"])
+def test_gradient_of_a_rules_parameter(name: str) -> None:
+    """The gradient by a rule's own parameters is finite and is the central difference."""
+    rng = np.random.default_rng(4)
+    rows = jnp.array(rng.normal(size=(60, MODELS)))
+    target = jnp.array(rng.normal(size=(60, MODELS)))
+    leaves, tree = jax.tree.flatten(RULES[name][1])
+
+    @jax.jit
+    def score(values: jax.Array) -> jax.Array:
+        params = tree.unflatten([values[i] for i in range(len(leaves))])
+        return jnp.sum(jnp.exp(weigh(name, rows, None, params)) * target)
+
+    values = jnp.stack(leaves)
+    gradient = jax.grad(score)(values)
+    for i, value in enumerate(leaves):
+        h = 1e-5 * value
+        ahead, behind = score(values.at[i].add(h)), score(values.at[i].add(-h))
+        np.testing.assert_allclose(gradient[i], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-7)
+
+
+def test_fixed_weights_do_not_move() -> None:
+    rule = fixed()
+    start = normalise(jnp.array([0.0, -1.0, -jnp.inf]))
+    _, after = rule.update((), rule.init((), start), start, info_of(jnp.arange(3.0)), jnp.int32(1))
+    np.testing.assert_array_equal(after, start)
+    np.testing.assert_allclose(np.exp(uniform(start)), [0.5, 0.5, 0.0])
+
+
+def test_mixture_is_moment_matched_and_ignores_members_left_out() -> None:
+    rng = np.random.default_rng(3)
+    means = rng.normal(size=(MODELS, 2))
+    covs = np.stack([np.eye(2) * (i + 1) for i in range(MODELS)])
+    means[2], covs[2] = np.nan, np.nan
+    log_weights = jnp.log(jnp.array([0.3, 0.7, 0.0]))
+    mixed = moment_match(log_weights, Gaussian(jnp.array(means), jnp.array(covs)))
+    expected = 0.3 * means[0] + 0.7 * means[1]
+    np.testing.assert_allclose(mixed.mean, expected, rtol=1e-14)
+    spread = 0.3 * 0.7 * np.outer(means[0] - means[1], means[0] - means[1])
+    np.testing.assert_allclose(mixed.cov, 0.3 * covs[0] + 0.7 * covs[1] + spread, rtol=1e-13)
+
+
+def test_info_of_a_bank_flags_a_veto_of_all() -> None:
+    info = info_of(jnp.full(MODELS, jnp.nan))
+    mixed = mixture_info(normalise(jnp.zeros(MODELS)), info)
+    assert mixed.flags == Flag.ALL_MODELS_VETOED
+    assert mixed.log_likelihood == 0
