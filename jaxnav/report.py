@@ -33,8 +33,7 @@ class Progress:
         )
 
     def __enter__(self) -> "Progress":
-        """Start the display."""
-        self._display.start()
+        """Return itself; the display starts with the first progress."""
         return self
 
     def __exit__(
@@ -44,10 +43,13 @@ class Progress:
         trace: TracebackType | None,
     ) -> None:
         """Stop the display."""
-        self._display.stop()
+        if self._tasks:
+            self._display.stop()
 
     def __call__(self, label: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` runs are done."""
+        if not self._tasks:
+            self._display.start()
         if label not in self._tasks:
             self._tasks[label] = self._display.add_task(label, total=total)
         self._display.update(self._tasks[label], completed=done)

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ def test_tiles_and_devices_do_not_change_a_run() -> None:
     one, two = jax.local_devices()[:1], jax.local_devices()[:2]
     assert len(two) == 2
 
-    def campaign(tile: int, devices: list[jax.Device]) -> Campaign:
+    def campaign(tile: int, devices: list[Any]) -> Campaign:
         return run_campaign(config, tile=tile, devices=devices, keep=1)
 
     reference = campaign(16, one)

@@ -33,7 +33,7 @@ def _best(result: StudyResult) -> str:
 def _draw_track(result: StudyResult, path: Path) -> None:
     a = result.arrays
     best = _best(result)
-    estimate = a["estimate"][:, list(a["method"]).index(best)]
+    estimate = a["estimate"][:, list(a["estimator"]).index(best)]
     with figure(path, (6.5, 6)) as drawing:
         axes = drawing.subplots()
         axes.plot(a["fix"][:, 0], a["fix"][:, 1], ".", ms=2, color="0.6", label="fixes")
@@ -49,7 +49,7 @@ def _draw_track(result: StudyResult, path: Path) -> None:
 def _draw_speed(result: StudyResult, path: Path) -> None:
     """Speed over time, and its difference from the receiver's Doppler speed."""
     a = result.arrays
-    methods = list(a["method"])
+    methods = list(a["estimator"])
     doppler = np.linalg.norm(a["doppler"], axis=-1)
     singles = [name for name in methods if name.startswith("kf-")]
     least = min(singles, key=lambda name: result.methods[name]["log_likelihood"])

@@ -36,7 +36,7 @@ def draw(result: StudyResult, directory: Path) -> list[Path]:
 def _draw_errors(result: StudyResult, path: Path) -> None:
     """One run: the errors of the three angles, and the oracle's with its envelope."""
     a = result.arrays
-    methods = list(a["method"])
+    methods = list(a["estimator"])
     oracle = methods.index("oracle")
     # The star tracker's noise is isotropic: the largest component bounds every angle's deviation.
     envelope = 3 * a["run_0_sigma"][:, oracle].max(axis=-1)
@@ -84,7 +84,7 @@ def _draw_trmse(result: StudyResult, path: Path) -> None:
     seconds = np.sqrt(square[:whole].reshape(-1, steps, square.shape[1]).mean(axis=1))
     with figure(path, (7.5, 4)) as drawing:
         axes = drawing.subplots()
-        for i, name in enumerate(a["method"]):
+        for i, name in enumerate(a["estimator"]):
             axes.plot(
                 a["time"][steps - 1 : whole : steps], seconds[:, i], color=COLOURS[name], label=name
             )

@@ -68,13 +68,13 @@ def _run_scenario(
         arrays=_arrays(config, campaign),
         dims={
             "time": ("time",),
-            "trmse": ("time", "method", "axis"),
+            "trmse": ("time", "estimator", "axis"),
             "mean_weights": ("time", "bank", "model"),
-            "run_0_error": ("time", "method", "axis"),
-            "run_0_sigma": ("time", "method", "component"),
+            "run_0_error": ("time", "estimator", "axis"),
+            "run_0_sigma": ("time", "estimator", "component"),
             "run_0_weights": ("time", "bank", "model"),
-            "mean_square": ("run", "method", "axis"),
-            "nees": ("run", "method"),
+            "mean_square": ("run", "estimator", "axis"),
+            "nees": ("run", "estimator"),
         },
     )
 
@@ -119,7 +119,7 @@ def _arrays(config: ImmaeConfig, campaign: Campaign) -> dict[str, Any]:
         "run_0_weights": first["weights"],
         "mean_square": campaign.rows.mean_square / ARCSEC**2,
         "nees": campaign.rows.nees,
-        "method": np.array(METHODS),
+        "estimator": np.array(METHODS),
         "axis": np.array(AXES),
         "bank": np.array(BANKS),
         "model": np.array(config.theta),
