@@ -53,16 +53,17 @@ class Goal(NamedTuple):
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
 
-def first_and_best(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """Return the seconds of the first call, which compiles, and the best of ``repeats`` more."""
-    first = _seconds(call)
-    return first, min(_seconds(call) for _ in range(repeats))
-
-
-def _seconds(call: Callable[[], Any]) -> float:
+def seconds(call: Callable[[], Any]) -> float:
+    """Return the wall time of one call, results and all."""
     start = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - start
+
+
+def best_in_turn(calls: Sequence[Callable[[], Any]], turns: int) -> list[float]:
+    """Return the best seconds of each call; they take turns, so a busy moment hits them alike."""
+    times = [[seconds(call) for call in calls] for _ in range(turns)]
+    return [min(column) for column in zip(*times, strict=True)]
 
 
 def peak_gib() -> float:

@@ -1,7 +1,7 @@
 """Other ways to run the bank's members: JAX libraries, filterpy, batched NumPy and plain C.
 
-Each takes the problem as matrices and gives the members' attitude and log-likelihood; the weights of
-the bank are no part of their work.
+Each takes the problem as matrices and gives the members' attitude and log-likelihood; the weights
+of the bank are no part of their work.
 """
 
 import ctypes
@@ -110,9 +110,9 @@ def cuthbert_series(H: Array, R: Array, P0: Array) -> Series:
 def jax_calls(series: Callable[[Array, Array, Array], Series]) -> Callable[[Dense], dict]:
     """Return how a user runs a JAX filter over models and runs: ``vmap`` and ``jit``.
 
-    Once as it is and once in tiles of runs, XLA being free to use both cores. Splitting the runs over
-    two host devices is no third way: batched LAPACK calls of two devices can wait for each other's
-    threads for ever.
+    Once as it is and once in tiles of runs, XLA being free to use both cores. Splitting the runs
+    over two host devices is no third way: batched LAPACK calls of two devices can wait for each
+    other's threads for ever.
     """
 
     def prepare(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:

@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxnav.estimation.banks.mixture import BankParams
 from jaxnav.estimation.types import FilterParams, Gaussian, replicate
-from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsInput, SinsCnsParams, sins_cns
+from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsInput, SinsCnsParams
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.simulation import build_world, fly_linear, noise_of, prior_sigma
@@ -48,8 +48,8 @@ class Problem(NamedTuple):
 class Dense(NamedTuple):
     """The same problem as matrices, NumPy arrays, for filters that know no structure.
 
-    The attitude is in arc seconds, which is no change of the problem: peers that add a fixed 1e-9 to
-    an innovation covariance would be wrong in radians squared.
+    The attitude is in arc seconds, which does not change the problem: peers that add a fixed 1e-9
+    to an innovation covariance would be wrong in radians squared.
 
     Attributes:
         F: ``(..., T, 15, 15)`` transition of each step, a leading run axis if it differs.
@@ -104,11 +104,10 @@ def own_inputs(inputs: SinsCnsInput, tilt: Array) -> SinsCnsInput:
     )
 
 
-def bank_params(problem: Problem, rule: Any = (), theta: tuple[float, ...] = THETA) -> BankParams:
+def bank_params(noise: SinsCnsParams, P0: Array, rule: Any = ()) -> BankParams:
     """Return the parameters of the bank of models under a weight rule."""
-    member = FilterParams(problem.noise, Gaussian(jnp.zeros(15), problem.P0))
-    members = replicate(member, len(theta))
-    scaled = members.model._replace(noise_scale=jnp.array(theta))
+    members = replicate(FilterParams(noise, Gaussian(jnp.zeros(15), P0)), len(THETA))
+    scaled = members.model._replace(noise_scale=jnp.array(THETA))
     return BankParams(members._replace(model=scaled), rule)
 
 
@@ -156,13 +155,13 @@ class Filtered(NamedTuple):
     evidence: np.ndarray
 
 
-def oracle(problem: Dense, run: int, theta: tuple[float, ...] = THETA) -> Filtered:
+def oracle(problem: Dense, run: int) -> Filtered:
     """Filter one run by the textbook: a loop over time and models, and Bayes' rule at the end."""
     F, Q = (m[run] if problem.own else m for m in (problem.F, problem.Q))
     H, R, z = problem.H, problem.R, problem.z[run]
-    steps, models = len(z), len(theta)
+    steps, models = len(z), len(THETA)
     attitude, log_likelihood = np.zeros((steps, models, 3)), np.zeros((steps, models))
-    for i, scale in enumerate(theta):
+    for i, scale in enumerate(THETA):
         x, P = np.zeros(15), problem.P0
         for k in range(steps):
             x, P = F[k] @ x, F[k] @ P @ F[k].T + scale * Q[k]

@@ -42,6 +42,7 @@ def plot_weights(axes: Any, time: Any, weights: Any, labels: Sequence[str]) -> N
     """Plot the weights ``(T, M)`` of a bank's models over time [s]."""
     for j, label in enumerate(labels):
         axes.plot(time, weights[:, j], label=label)
+    axes.margins(x=0)
     axes.set_ylim(-0.02, 1.02)
     axes.set_ylabel("weight")
     axes.set_xlabel("time [s]")

@@ -62,12 +62,16 @@ def test_noise_step_at_full_size(step: Campaign) -> None:
 
 @pytest.mark.slow
 def test_the_two_chains_agree(matched: Campaign, step: Campaign) -> None:
-    for scenario, full in (("matched-noise", matched), ("noise-step", step)):
-        linear = run_campaign(ImmaeConfig(scenario=scenario, chain="linear", seed=1))
+    configs = (
+        ImmaeConfig(scenario="matched-noise", chain="linear", seed=1),
+        ImmaeConfig(scenario="noise-step", chain="linear", seed=1),
+    )
+    for config, full in zip(configs, (matched, step), strict=True):
+        linear = run_campaign(config)
         for i in range(len(METHODS)):
             a = rmse(full.rows.mean_square[:, i].mean(axis=-1))
             b = rmse(linear.rows.mean_square[:, i].mean(axis=-1))
-            assert abs(a.value - b.value) < 2 * np.hypot(a.se, b.se), (scenario, METHODS[i])
+            assert abs(a.value - b.value) < 2 * np.hypot(a.se, b.se), (config.scenario, METHODS[i])
 
 
 @pytest.mark.slow

@@ -38,6 +38,7 @@ ORDER = (
     "studies.immae.config",
     "studies.immae.simulation",
     "studies.immae.methods",
+    "studies.immae.tuning",
     "studies.immae.claims",
     "studies.immae.study",
     "studies.immae.figures",

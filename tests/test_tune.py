@@ -11,12 +11,10 @@ import pytest
 from jaxnav.datasets import load_rtklib_pos
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.tune import POSITIVE, UNIT, fit, negative_log_likelihood
-from jaxnav.estimation.types import FilterParams, Gaussian, Obs
-from jaxnav.navigation.models.sins_cns import sins_cns_attitude
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
 from jaxnav.studies.gnss_track.study import MODEL, filter_params, track_data
 from jaxnav.studies.immae.config import ImmaeConfig
-from jaxnav.studies.immae.simulation import World, build_world, fly_linear, noise_of, prior_sigma
+from jaxnav.studies.immae.tuning import noise_loss
 
 DRIVE = Path(__file__).resolve().parents[2] / "shared" / "data" / "rtk_drive"
 
@@ -50,41 +48,10 @@ def test_fit_refuses_a_start_outside_the_domain_or_without_a_loss() -> None:
         fit(lambda p: p * jnp.nan, 1.0)
 
 
-@pytest.fixture(scope="module")
-def short_world() -> tuple[ImmaeConfig, World]:
-    config = ImmaeConfig(
-        scenario="matched-noise", duration_s=100.0, chain="linear", initial="drawn"
-    )
-    return config, build_world(config)
-
-
-def _loss_of_scale(config: ImmaeConfig, world: World, runs: int):
-    """Negative log-likelihood of 16 simulated runs as a function of the factor on Q0."""
-    keys = jax.random.split(jax.random.key(11), runs)
-    flights = jax.jit(
-        jax.vmap(lambda key: fly_linear(key, world, config.filter_period_s, config.imu_step).z)
-    )(keys)
-    filter = kf(sins_cns_attitude(config.filter_period_s, config.imu_step))
-    # phi and eps are the first and the fourth block of P0
-    sigma = prior_sigma(config)[jnp.array([0, 1, 2, 9, 10, 11])]
-    initial = Gaussian(jnp.zeros(6), jnp.diag(sigma**2))
-    valid = jnp.ones(flights.shape[1:], bool)
-
-    def loss(scale: jax.Array) -> jax.Array:
-        params = FilterParams(noise_of(config)._replace(noise_scale=scale), initial)
-        per_run = jax.vmap(
-            lambda z: negative_log_likelihood(
-                filter, params, world.nominal, Obs(z, valid), segment=45
-            )
-        )(flights)
-        return jnp.mean(per_run)
-
-    return loss
-
-
-def test_noise_wrong_by_four_is_found_again(short_world: tuple[ImmaeConfig, World]) -> None:
-    config, world = short_world
-    loss = _loss_of_scale(config, world, 16)
+def test_noise_wrong_by_four_is_found_again() -> None:
+    """Sixteen flights of 100 s: one standard error of the factor is about 5.5 %."""
+    config = ImmaeConfig(scenario="matched-noise", duration_s=100.0, initial="drawn")
+    loss = noise_loss(config, jax.random.key(11), runs=16)
     found = fit(loss, 4.0, steps=60)
     assert abs(found.params - 1.0) < 0.15
     assert found.rejected == 0

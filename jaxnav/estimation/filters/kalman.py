@@ -47,9 +47,10 @@ def kf(model: Model) -> Filter:
     that are not valid have no effect. An innovation covariance that is not positive definite skips
     the update and raises a flag.
 
-    In float64 the Joseph form keeps the covariance of the ill-conditioned update of Grewal and
-    Andrews to 1e-7 relative for a ratio of measurement to prior sigma of 1e-6; below that
-    :func:`~jaxnav.estimation.filters.square_root.square_root_kf` is the form to use.
+    Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-7 for a
+    ratio of measurement to prior sigma of 1e-6 in float64, to 1e-3 for 1e-2 in float32; beyond
+    that a flag is raised, and :func:`~jaxnav.estimation.filters.square_root.square_root_kf` is the
+    form to use.
 
     References:
         Si, Wang, Niu, "High precision attitude estimation algorithm for SINS/CNS integrated

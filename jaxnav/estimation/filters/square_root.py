@@ -31,8 +31,10 @@ def square_root_kf(model: Model) -> Filter:
     with ``Theta`` orthogonal. Parameters, offsets and invalid channels are as in
     :func:`~jaxnav.estimation.filters.kalman.kf`. ``P``, ``Q`` and ``R`` may be singular; gradients
     need ``[Phi L, sqrt(Q)]`` of full row rank. Costs about twenty times the Joseph form, since
-    each step holds two QR factorisations; the covariance of the ill-conditioned update of Grewal
-    and Andrews is right to 1e-6 down to a ratio of measurement to prior sigma of 1e-9.
+    each step holds two QR factorisations.
+
+    Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
+    ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32.
 
     References:
         Kailath, Sayed, Hassibi (2000), Linear Estimation, section 12.3.

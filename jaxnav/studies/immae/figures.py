@@ -34,7 +34,7 @@ def draw(result: StudyResult, directory: Path) -> list[Path]:
 
 
 def _draw_errors(result: StudyResult, path: Path) -> None:
-    """One run: the errors of the three angles, and the oracle's with its envelope."""
+    """One run: the errors of the three angles, and the oracle's, which few leave, above them."""
     a = result.arrays
     methods = list(a["estimator"])
     oracle = methods.index("oracle")
@@ -42,11 +42,10 @@ def _draw_errors(result: StudyResult, path: Path) -> None:
     envelope = 3 * a["run_0_sigma"][:, oracle].max(axis=-1)
     with figure(path, (7.5, 7.5)) as drawing:
         for row, axes in enumerate(drawing.subplots(3, 1, sharex=True)):
-            for name in SHOWN[result.scenario]:
+            for name in (*SHOWN[result.scenario], "oracle"):
                 error = a["run_0_error"][:, methods.index(name), row]
-                axes.plot(a["time"], error, color=COLOURS[name], label=name, alpha=0.8, lw=0.6)
-            error = a["run_0_error"][:, oracle, row]
-            axes.plot(a["time"], error, color=COLOURS["oracle"], lw=0.5, label="oracle", alpha=0.7)
+                axes.plot(a["time"], error, color=COLOURS[name], label=name, lw=0.5)
+            axes.margins(x=0)
             for sign in (-1, 1):
                 label = "oracle 3 sigma" if sign > 0 else None
                 axes.plot(a["time"], sign * envelope, color="0.4", ls="--", lw=0.8, label=label)
@@ -88,6 +87,7 @@ def _draw_trmse(result: StudyResult, path: Path) -> None:
             axes.plot(
                 a["time"][steps - 1 : whole : steps], seconds[:, i], color=COLOURS[name], label=name
             )
+        axes.margins(x=0)
         axes.set_ylim(0, 1.3 * float(np.max(seconds[len(seconds) // 20 :])))
         axes.set_xlabel("time [s]")
         axes.set_ylabel("attitude RMSE over runs [arcsec]")

@@ -1,0 +1,276 @@
+"""Inputs that break filters: ill-conditioned updates, singular noise, huge priors, long runs."""
+
+from fractions import Fraction
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from jaxnav.estimation.filters.kalman import kf
+from jaxnav.estimation.filters.square_root import square_root_kf
+from jaxnav.estimation.run import run
+from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Model, Obs, observed
+
+BUILDERS = {"kf": kf, "square_root_kf": square_root_kf}
+each_filter = pytest.mark.parametrize("name", BUILDERS)
+
+
+class Matrices(NamedTuple):
+    """A time-invariant linear model as parameters."""
+
+    Phi: Array
+    Q: Array
+    H: Array
+    R: Array
+
+
+MODEL = Model(
+    transition=lambda p, x, u: p.Phi @ x,
+    process_noise=lambda p, x, u: p.Q,
+    observe=lambda p, x, u: p.H @ x,
+    observation_noise=lambda p, x, u: p.R,
+)
+FILTERS: dict[str, Filter] = {name: build(MODEL) for name, build in BUILDERS.items()}
+
+
+def static(H: Array, R: Array, P0: Array) -> FilterParams:
+    """Parameters of a constant state that is observed."""
+    n = P0.shape[0]
+    noise = Matrices(jnp.eye(n, dtype=P0.dtype), jnp.zeros((n, n), P0.dtype), H, R)
+    return FilterParams(noise, Gaussian(jnp.zeros(n, P0.dtype), P0))
+
+
+def one_update(name: str, params: FilterParams, z: Array) -> tuple[Gaussian, Info]:
+    """Update the prior with one observation."""
+    filter = FILTERS[name]
+    state, info = filter.update(
+        params, filter.init(params), jnp.zeros(()), Obs(z, jnp.ones(z.shape, bool))
+    )
+    return filter.estimate(state), info
+
+
+one_update_jit = jax.jit(one_update, static_argnums=0)
+
+
+def nearly_parallel(delta: float, dtype: jnp.dtype) -> FilterParams:
+    """Two nearly equal measurements, much finer than the prior (Grewal and Andrews, ch. 6)."""
+    H = jnp.array([[1, 1, 1], [1, 1, 1 + delta]], dtype)
+    return static(H, jnp.full(2, delta**2, dtype), jnp.eye(3, dtype=dtype))
+
+
+def exact_posterior(delta: float) -> np.ndarray:
+    """The covariance after that update, in rational numbers."""
+    d = Fraction(delta)
+    H = [[Fraction(1)] * 3, [Fraction(1), Fraction(1), 1 + d]]
+    S = [[sum(a * b for a, b in zip(row, col, strict=True)) for col in H] for row in H]
+    S[0][0] += d * d
+    S[1][1] += d * d
+    det = S[0][0] * S[1][1] - S[0][1] * S[1][0]
+    inverse = [[S[1][1] / det, -S[0][1] / det], [-S[1][0] / det, S[0][0] / det]]
+    return np.array(
+        [
+            [
+                float(
+                    (i == j)
+                    - sum(H[a][i] * inverse[a][b] * H[b][j] for a in (0, 1) for b in (0, 1))
+                )
+                for j in range(3)
+            ]
+            for i in range(3)
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "delta", "bound"),
+    [
+        ("kf", jnp.float64, 1e-4, 1e-12),
+        ("kf", jnp.float64, 1e-6, 1e-7),
+        ("square_root_kf", jnp.float64, 1e-7, 1e-7),
+        ("square_root_kf", jnp.float64, 1e-9, 1e-6),
+        ("kf", jnp.float32, 1e-2, 1e-3),
+        ("square_root_kf", jnp.float32, 1e-4, 1e-3),
+    ],
+)
+def test_ill_conditioned_update_is_right(
+    name: str, dtype: jnp.dtype, delta: float, bound: float
+) -> None:
+    delta = float(np.asarray(delta, dtype))
+    params = nearly_parallel(delta, dtype)
+    estimate, info = one_update_jit(name, params, jnp.zeros(2, dtype))
+    # the second row of H is rounded to the precision of the filter: judge by what it was given
+    expected = exact_posterior(float(params.model.H[1, 2]) - 1)
+    if float(params.model.H[1, 2]) - 1 != delta:
+        expected = _exact_with_noise(float(params.model.H[1, 2]), delta)
+    error = np.abs(np.asarray(estimate.cov, float) - expected).max() / np.abs(expected).max()
+    assert error < bound
+    assert not info.flags & Flag.NOT_POSITIVE_DEFINITE
+
+
+def _exact_with_noise(corner: float, sigma: float) -> np.ndarray:
+    """As :func:`exact_posterior`, for a corner of H that was rounded, in 60 digits."""
+    from decimal import Decimal, getcontext
+
+    getcontext().prec = 60
+    h, r = Decimal(corner), Decimal(sigma) ** 2
+    one, two = Decimal(1), Decimal(2)
+    S = [[3 + r, two + h], [two + h, two + h * h + r]]
+    det = S[0][0] * S[1][1] - S[0][1] ** 2
+    inverse = [[S[1][1] / det, -S[0][1] / det], [-S[0][1] / det, S[0][0] / det]]
+    H = [[one, one, one], [one, one, h]]
+    return np.array(
+        [
+            [
+                float(
+                    (one if i == j else Decimal(0))
+                    - sum(H[a][i] * inverse[a][b] * H[b][j] for a in (0, 1) for b in (0, 1))
+                )
+                for j in range(3)
+            ]
+            for i in range(3)
+        ]
+    )
+
+
+@pytest.mark.parametrize("delta", [1e-8, 1e-10, 1e-14])
+def test_joseph_form_flags_what_it_cannot_solve(delta: float) -> None:
+    estimate, info = one_update_jit("kf", nearly_parallel(delta, jnp.float64), jnp.zeros(2))
+    assert info.flags & (Flag.ILL_CONDITIONED | Flag.NOT_POSITIVE_DEFINITE)
+    assert np.all(np.isfinite(estimate.cov))
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_duplicate_perfect_sensors_are_flagged(name: str) -> None:
+    params = static(jnp.array([[1.0, 0.0], [1.0, 0.0]]), jnp.zeros(2), jnp.eye(2))
+    estimate, info = one_update_jit(name, params, jnp.ones(2))
+    assert info.flags & (Flag.ILL_CONDITIONED | Flag.NOT_POSITIVE_DEFINITE)
+    assert np.all(np.isfinite(estimate.mean))
+    assert np.all(np.isfinite(estimate.cov))
+
+
+@each_filter
+def test_perfect_knowledge_and_perfect_sensors(name: str) -> None:
+    """No prior uncertainty and no noise at all: the update is skipped, with finite gradients."""
+    params = static(jnp.array([[1.0, 0.0]]), jnp.zeros(1), jnp.zeros((2, 2)))
+    estimate, info = one_update_jit(name, params, jnp.ones(1))
+    assert info.flags & Flag.NOT_POSITIVE_DEFINITE
+    np.testing.assert_array_equal(estimate.mean, 0)
+    np.testing.assert_array_equal(estimate.cov, 0)
+    if name == "kf":
+
+        def moved(noise: Array) -> Array:
+            model = params.model._replace(R=noise)
+            estimate, info = one_update(name, params._replace(model=model), jnp.ones(1))
+            return jnp.sum(estimate.mean) + info.log_likelihood
+
+        assert np.all(np.isfinite(jax.grad(moved)(jnp.zeros(1))))
+
+
+@each_filter
+def test_one_perfect_channel_of_two(name: str) -> None:
+    params = static(jnp.eye(2), jnp.array([0.0, 4.0]), jnp.eye(2))
+    estimate, info = one_update_jit(name, params, jnp.array([3.0, 5.0]))
+    np.testing.assert_allclose(estimate.mean, [3.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(estimate.cov, np.diag([0.0, 0.8]), atol=1e-12)
+    assert info.flags == 0
+
+
+@each_filter
+@pytest.mark.parametrize(
+    ("dtype", "prior", "noise"), [(jnp.float64, 1e12, 1e-6), (jnp.float32, 1e6, 1e-3)]
+)
+def test_huge_prior_and_fine_sensor(
+    name: str, dtype: jnp.dtype, prior: float, noise: float
+) -> None:
+    H = jnp.array([[1.0, 0.5]], dtype)
+    params = static(H, jnp.full(1, noise, dtype), prior * jnp.eye(2, dtype=dtype))
+    estimate, _ = one_update_jit(name, params, jnp.ones(1, dtype))
+    cov = np.asarray(estimate.cov, float)
+    assert np.all(np.isfinite(cov))
+    # the observed direction is known, the other keeps the prior
+    assert np.linalg.eigvalsh(cov).min() >= -8 * np.finfo(dtype).eps * prior
+    assert abs(float(H[0] @ estimate.mean) - 1) < 1e-3
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@each_filter
+def test_hundred_thousand_steps_stay_positive(name: str, dtype: jnp.dtype) -> None:
+    """Position, velocity and bias on three axes with hardly any process noise (nine states)."""
+    one, zero = np.eye(3), np.zeros((3, 3))
+    dt = 0.01
+    Phi = np.block([[one, dt * one, zero], [zero, one, dt * one], [zero, zero, one]])
+    noise = Matrices(
+        Phi=jnp.asarray(Phi, dtype),
+        Q=jnp.diag(jnp.asarray([0.0] * 3 + [1e-8] * 3 + [1e-12] * 3, dtype)),
+        H=jnp.asarray(np.hstack([one, zero, zero]), dtype),
+        R=jnp.full(3, 1e-4, dtype),
+    )
+    P0 = jnp.diag(jnp.asarray([1e6] * 3 + [1e2] * 3 + [1.0] * 3, dtype))
+    params = FilterParams(noise, Gaussian(jnp.zeros(9, dtype), P0))
+    steps = 20_000 if name == "square_root_kf" else 100_000
+    observations = Obs(jnp.zeros((steps, 3), dtype), jnp.ones((steps, 3), bool))
+    final = run(
+        FILTERS[name],
+        params,
+        jnp.zeros(steps, dtype),
+        observations,
+        record=lambda state, info: info.flags,
+    )
+    assert np.all(np.asarray(final.record)[10:] & Flag.NOT_POSITIVE_DEFINITE == 0)
+    cov = np.asarray(FILTERS[name].estimate(final.final).cov, float)
+    np.testing.assert_array_equal(cov, cov.T)
+    sigma = np.sqrt(np.diag(cov))
+    correlation = cov / np.outer(sigma, sigma)
+    assert np.linalg.eigvalsh(correlation).min() >= (-1e-12 if dtype == jnp.float64 else -1e-5)
+    np.testing.assert_allclose(sigma[:3], sigma[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@each_filter
+def test_bad_value_equals_the_masked_run(name: str, bad: float) -> None:
+    """First, middle and last step, through the screen for recorded data."""
+    rng = np.random.default_rng(0)
+    params = static(jnp.eye(2), jnp.ones(2), jnp.eye(2))
+    for k in (0, 10, 19):
+        z = rng.normal(size=(20, 2))
+        z[k, 1] = bad
+        mask = np.isfinite(z)
+        screened = run(FILTERS[name], params, jnp.zeros(20), observed(jnp.array(z)))
+        masked = run(
+            FILTERS[name],
+            params,
+            jnp.zeros(20),
+            Obs(jnp.array(np.where(mask, z, 1e300)), jnp.array(mask)),
+        )
+        for a, b in zip(jax.tree.leaves(screened), jax.tree.leaves(masked), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@each_filter
+def test_units_do_not_matter(name: str) -> None:
+    """The same system in other units, a condition of 1e20: equal after scaling back."""
+    rng = np.random.default_rng(1)
+    scale = np.array([1.0, 1e-5, 1e5])
+    A = np.eye(3) + 0.1 * rng.normal(size=(3, 3))
+    H = rng.normal(size=(2, 3))
+    P0 = np.diag([1.0, 2.0, 3.0])
+    Q = 0.01 * np.eye(3)
+    z = jnp.array(rng.normal(size=(50, 2)))
+
+    def filtered(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        noise = Matrices(
+            jnp.array(np.diag(s) @ A @ np.diag(1 / s)),
+            jnp.array(np.outer(s, s) * Q),
+            jnp.array(H / s),
+            jnp.full(2, 0.5),
+        )
+        params = FilterParams(noise, Gaussian(jnp.zeros(3), jnp.array(np.outer(s, s) * P0)))
+        estimate, _ = run(FILTERS[name], params, jnp.zeros(50), observed(z)).record
+        return np.asarray(estimate.mean) / s, np.asarray(estimate.cov) / np.outer(s, s)
+
+    plain, scaled = filtered(np.ones(3)), filtered(scale)
+    np.testing.assert_allclose(scaled[0], plain[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(scaled[1], plain[1], rtol=1e-9, atol=1e-9)
