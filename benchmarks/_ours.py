@@ -33,7 +33,7 @@ def structured(problem: Problem, own: bool) -> Callable[[], Statistics]:
 
 
 def unstructured(matrices: Dense) -> Callable[[], Statistics]:
-    """Return the same study with the transition as a dense product, in the units of ``matrices``."""
+    """Return the same study with the transition as a dense product, in the matrices' units."""
     H, P0, z = (jnp.asarray(m) for m in (matrices.H, matrices.P0, matrices.z))
     source = (jnp.asarray(matrices.F), jnp.asarray(matrices.Q))
     run_one = _study_run(mmae(kf(_dense_model(H))), _picked if matrices.own else _same)

@@ -145,12 +145,14 @@ class Filtered(NamedTuple):
     Attributes:
         attitude: ``(T, M, 3) [arcsec]`` of every member.
         log_likelihood: ``(T, M)``.
-        mixture: ``(T, 3) [arcsec]`` mean of the bank under Bayes' rule.
+        weights: ``(T, M)`` under Bayes' rule, after the update.
+        mixture: ``(T, 3) [arcsec]`` mean of the bank.
         evidence: ``(T,)`` log-likelihood of the bank.
     """
 
     attitude: np.ndarray
     log_likelihood: np.ndarray
+    weights: np.ndarray
     mixture: np.ndarray
     evidence: np.ndarray
 
@@ -175,4 +177,4 @@ def oracle(problem: Dense, run: int) -> Filtered:
     total = np.logaddexp.reduce(np.cumsum(log_likelihood, axis=0), axis=1) - np.log(models)
     weights = np.exp(np.cumsum(log_likelihood, axis=0) - np.log(models) - total[:, None])
     mixture = np.einsum("km,kmi->ki", weights, attitude)
-    return Filtered(attitude, log_likelihood, mixture, np.diff(total, prepend=0.0))
+    return Filtered(attitude, log_likelihood, weights, mixture, np.diff(total, prepend=0.0))

@@ -4,7 +4,7 @@ Microseconds per filter step and model: 15 states, 3 measurements, float64, a ba
 over 16 and 128 Monte Carlo runs. The runs either share one covariance recursion, because their
 inputs are the same, or each has its own. jaxnav's figure contains what makes the members a bank
 (weights, mixture, statistics of each run); the peers run the members alone. All contestants take
-turns on the clock, so that a busy moment of the machine is nobody's alone, and the best turn counts.
+turns on the clock, so that a busy moment of the machine is nobody's alone; the best turn counts.
 """
 
 import sys

@@ -102,7 +102,7 @@ def monte_carlo(
 
     def compute(start: int, place: int) -> tuple[RunOutput, Array]:
         return jax.block_until_ready(
-            _run_tile(run_one, tile, np.int32(start + place * tile), *inputs[place])
+            _run_tile(run_one, tile, keep > 0, np.int32(start + place * tile), *inputs[place])
         )
 
     with ThreadPoolExecutor(len(chosen)) as pool:
@@ -140,10 +140,11 @@ def _first(tree: Any, count: int) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], tree)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def _run_tile(
     run_one: Callable[[Array, Any], RunOutput],
     tile: int,
+    traced: bool,
     start: Array,
     key: Array,
     runs: Array,
@@ -164,7 +165,8 @@ def _run_tile(
         mask = counted.reshape(-1, *([1] * (leaf.ndim - 1)))
         return jnp.sum(jnp.where(mask, leaf, 0), axis=0)
 
-    return output._replace(curve=jax.tree.map(add_up, output.curve)), finite
+    curve = jax.tree.map(add_up, output.curve)
+    return RunOutput(output.row, curve, output.trace if traced else ()), finite
 
 
 def _all_finite(row: Any) -> Array:

@@ -188,10 +188,14 @@ def moment_match(log_weights: Array, members: Gaussian) -> Gaussian:
     w = jnp.where(used, jnp.exp(log_weights), 0)
     means = jnp.where(used[:, None], members.mean, 0)
     covs = jnp.where(used[:, None, None], members.cov, 0)
-    mean = jnp.sum(w[:, None] * means, axis=0)
-    spread = jnp.where(used[:, None], means - mean[None], 0)
-    outer = spread[:, :, None] * spread[:, None, :]
-    return Gaussian(mean, jnp.sum(w[:, None, None] * (covs + outer), axis=0))
+    # Sums written out over the few models fuse; a reduction over a short axis does not.
+    models = range(log_weights.shape[0])
+    mean = sum((w[i] * means[i] for i in models), jnp.zeros_like(means[0]))
+    cov = jnp.zeros_like(covs[0])
+    for i in models:
+        spread = jnp.where(used[i], means[i] - mean, 0)
+        cov = cov + w[i] * (covs[i] + spread[:, None] * spread[None, :])
+    return Gaussian(mean, cov)
 
 
 def mixture_info(log_weights: Array, info: Info) -> Info:

@@ -124,12 +124,13 @@ def panel_params(config: ImmaeConfig) -> BankParams:
 
 
 def _record(state: PanelState, info: Any) -> tuple[Gaussian, Array]:
-    """Keep the attitude of every method ``(methods, 3)`` and the banks' log-weights."""
+    """Keep the attitude of every method ``(methods, 3)`` and the banks' weights."""
     del info
     phi = LAYOUT.phi
     attitude = Gaussian(state.members.x[:, phi], state.members.P[:, phi, phi])
     log_weights = jnp.stack([state.log_weights[name] for name in METHODS])
-    return jax.vmap(moment_match, in_axes=(0, None))(log_weights, attitude), log_weights
+    weights = jnp.exp(jnp.stack([state.log_weights[name] for name in BANKS]))
+    return jax.vmap(moment_match, in_axes=(0, None))(log_weights, attitude), weights
 
 
 @cache
@@ -151,16 +152,15 @@ def run_one(chain_name: str, period: float, imu_step: float, models: int) -> Any
         # One mask for all runs: the covariances may then be shared between them.
         observations = Obs(flight.z, jnp.ones(world.dcm.shape[:2], bool))
         trace = run(comparison, params, flight.inputs, observations, record=_record)
-        attitude, log_weights = trace.record
+        attitude, weights = trace.record
         rotation = jax.vmap(_residual_rotation)(attitude.mean, flight.error[:, LAYOUT.phi])
         error = jnp.einsum("kij,kmj->kmi", world.euler_map, rotation)[..., jnp.array([1, 0, 2])]
         consistency = jax.vmap(jax.vmap(nees))(rotation, attitude.cov)
-        weights = jnp.exp(log_weights[:, :, :models])
+        weights = weights[:, :, :models]
         row = _row(error, consistency, weights)
-        banks = jnp.array([METHODS.index(name) for name in BANKS])
         sigma = jnp.sqrt(jnp.diagonal(attitude.cov, axis1=-2, axis2=-1))
-        curve = {"square": error**2, "nees": consistency, "weights": weights[:, banks]}
-        kept = {"error": error, "weights": weights[:, banks], "sigma": sigma}
+        curve = {"square": error**2, "nees": consistency, "weights": weights}
+        kept = {"error": error, "weights": weights, "sigma": sigma}
         return RunOutput(row, curve, kept)
 
     return run_methods
@@ -179,7 +179,7 @@ def _residual_rotation(estimated: Array, true: Array) -> Array:
 def _row(error: Array, consistency: Array, weights: Array) -> Row:
     """Condense the histories ``(K, methods, ...)`` of one run."""
     steps, models = weights.shape[0], weights.shape[2]
-    mmae = weights[:, METHODS.index("mmae")]
+    mmae = weights[:, BANKS.index("mmae")]
     second = min(1, models - 1)
     prefers = (mmae[:, second] > mmae[:, 0]) & (jnp.arange(steps) >= steps // 3)
     return Row(
