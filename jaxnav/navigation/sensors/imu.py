@@ -46,8 +46,6 @@ def corrupt(
     sigma = jnp.sqrt(variance_scale)[:, None]
     gyro = jax.random.normal(gyro_key, dtheta.shape, dtheta.dtype)
     accel = jax.random.normal(accel_key, dvel.shape, dvel.dtype)
-    # Without the barrier XLA draws the numbers again for every component that uses them.
-    gyro, accel = jax.lax.optimization_barrier((gyro, accel))
     return (
         dtheta + step * (errors.gyro_drift[None] + sigma * gyro * errors.gyro_noise[None]),
         dvel + step * (errors.accel_bias[None] + sigma * accel * errors.accel_noise[None]),
