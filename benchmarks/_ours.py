@@ -25,11 +25,11 @@ class Statistics(NamedTuple):
     last: Array
 
 
-def structured(problem: Problem, own: bool) -> Callable[[], Statistics]:
-    """Return the Monte Carlo study of the library's model."""
+def structured(problem: Problem, own: bool, tile: int | None = None) -> Callable[[], Statistics]:
+    """Return the Monte Carlo study of the library's model, in tiles of a size or the default."""
     source = (problem.inputs, problem.tilt) if own else problem.inputs
     run_one = _study_run(mmae(kf(sins_cns(PERIOD, IMU_STEP))), _turned if own else _same)
-    return _study(run_one, problem.z, source, bank_params(problem.noise, problem.P0))
+    return _study(run_one, problem.z, source, bank_params(problem.noise, problem.P0), tile)
 
 
 def unstructured(matrices: Dense) -> Callable[[], Statistics]:
@@ -92,8 +92,10 @@ def _picked(source: Any, index: Array) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], source)
 
 
-def _study(run_one: Callable, z: Array, source: Any, params: Any) -> Callable[[], Statistics]:
+def _study(
+    run_one: Callable, z: Array, source: Any, params: Any, tile: int | None = None
+) -> Callable[[], Statistics]:
     key, runs = jax.random.key(1), len(z)
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(runs, dtype=jnp.int32))
     shared = (jax.random.key_data(keys), z, source, params)
-    return lambda: monte_carlo(run_one, key, runs, shared).rows
+    return lambda: monte_carlo(run_one, key, runs, shared, tile=tile).rows

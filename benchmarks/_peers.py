@@ -57,17 +57,16 @@ def first_prediction(F: Array, Q: Array, P0: Array) -> Array:
 def dynamax_series(H: Array, R: Array, P0: Array) -> Series:
     """Return dynamax's linear-Gaussian filter."""
     try:
-        from dynamax.linear_gaussian_ssm.inference import lgssm_filter, make_lgssm_params
+        from dynamax.linear_gaussian_ssm import inference  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise Missing("dynamax is not installed") from error
 
     def filter_one(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
         Q = G @ jnp.swapaxes(G, -1, -2)
         P = first_prediction(F, Q, P0)
-        # The arguments' shape hints are for constant matrices; the time axis is documented.
-        out = lgssm_filter(make_lgssm_params(jnp.zeros(15), P, F, Q, H, R), z)
-        means: Any = out.filtered_means
-        return means[:, :3], jnp.asarray(out.marginal_loglik)
+        params = inference.make_lgssm_params(jnp.zeros(15), P, F, Q, H, R)
+        out = inference.lgssm_filter(params, z)
+        return jnp.asarray(out.filtered_means)[:, :3], jnp.asarray(out.marginal_loglik)
 
     return filter_one
 
@@ -75,7 +74,7 @@ def dynamax_series(H: Array, R: Array, P0: Array) -> Series:
 def smcx_series(H: Array, R: Array, P0: Array) -> Series:
     """Return smcx's Kalman filter."""
     try:
-        from smcx import kalman_filter
+        from smcx import kalman_filter  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise Missing("smcx is not installed") from error
 
@@ -83,7 +82,7 @@ def smcx_series(H: Array, R: Array, P0: Array) -> Series:
         Q = G @ jnp.swapaxes(G, -1, -2)
         P = first_prediction(F, Q, P0)
         out = kalman_filter(jnp.zeros(15), P, F[1:], Q[1:], H, R, z)
-        return out.filtered_means[:, :3], out.marginal_loglik
+        return out.filtered_means[:, :3], jnp.asarray(out.marginal_loglik)
 
     return filter_one
 
@@ -91,18 +90,24 @@ def smcx_series(H: Array, R: Array, P0: Array) -> Series:
 def cuthbert_series(H: Array, R: Array, P0: Array) -> Series:
     """Return cuthbert's square-root Kalman filter, in sequential form."""
     try:
-        from cuthbert import filter as run_filter
-        from cuthbert.gaussian import kalman
+        from cuthbert import filter as run_filter  # pyright: ignore[reportMissingImports]
+        from cuthbert.gaussian import kalman  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise Missing("cuthbert is not installed") from error
 
     def filter_one(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
         root = jnp.concatenate([G, jnp.zeros((len(G), 15, 9))], axis=-1)
-        dynamics = lambda u: (u[0], jnp.zeros(15), u[1])  # noqa: E731
-        observation = lambda u: (H, jnp.zeros(3), jnp.sqrt(R), u[2])  # noqa: E731
+
+        def dynamics(model_inputs: Any) -> tuple[Array, Array, Array]:
+            return model_inputs[0], jnp.zeros(15), model_inputs[1]
+
+        def observation(model_inputs: Any) -> tuple[Array, Array, Array, Array]:
+            return H, jnp.zeros(3), jnp.sqrt(R), model_inputs[2]
+
         built = kalman.build_filter(jnp.zeros(15), jnp.sqrt(P0), dynamics, observation)
         states = run_filter(built, (F, root, z), built.init_prepare())
-        return states.mean[1:, :3], states.log_normalizing_constant[-1]
+        mean, total = states.mean, states.log_normalizing_constant
+        return mean[1:, :3], total[-1]
 
     return filter_one
 
@@ -120,8 +125,8 @@ def jax_calls(series: Callable[[Array, Array, Array], Series]) -> Callable[[Dens
         axis = 0 if problem.own else None
 
         def models(F: Array, G: Array, z: Array) -> tuple[Array, Array]:
-            each = lambda scale: filter_one(F, jnp.sqrt(scale) * G, z)  # noqa: E731
-            return jax.vmap(each)(jnp.array(THETA))
+            roots = jnp.sqrt(jnp.array(THETA))
+            return jax.vmap(lambda root: filter_one(F, root * G, z))(roots)
 
         batch = jax.vmap(models, in_axes=(axis, axis, 0))
 
@@ -142,7 +147,7 @@ def jax_calls(series: Callable[[Array, Array, Array], Series]) -> Callable[[Dens
 def prepare_filterpy(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:
     """Return filterpy's loop over one run and one model after the other."""
     try:
-        from filterpy.kalman import KalmanFilter
+        from filterpy.kalman import KalmanFilter  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise Missing("filterpy is not installed") from error
     F = problem.F if problem.own else problem.F[None]

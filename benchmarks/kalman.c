@@ -9,14 +9,15 @@
 #define N 15
 #define M 3
 
-/* C = A B, or A B' where the name says so; the sizes are constants, so that the loops vectorise. */
-#define MULTIPLY(name, rows, inner, columns)                                                       \
-  static void name(const double *restrict A, const double *restrict B, double *restrict C) {       \
-    for (int i = 0; i < rows; i++) {                                                               \
-      for (int j = 0; j < columns; j++) C[i * columns + j] = 0.0;                                  \
-      for (int k = 0; k < inner; k++)                                                              \
-        for (int j = 0; j < columns; j++) C[i * columns + j] += A[i * inner + k] * B[k * columns + j]; \
-    }                                                                                              \
+/* C = A B for constant sizes. A row is gathered in registers before it is stored. */
+#define MULTIPLY(name, rows, inner, columns)                                                 \
+  static void name(const double *restrict A, const double *restrict B, double *restrict C) { \
+    for (int i = 0; i < rows; i++) {                                                         \
+      double row[columns] = {0.0};                                                           \
+      for (int k = 0; k < inner; k++)                                                        \
+        for (int j = 0; j < columns; j++) row[j] += A[i * inner + k] * B[k * columns + j];   \
+      for (int j = 0; j < columns; j++) C[i * columns + j] = row[j];                         \
+    }                                                                                        \
   }
 
 MULTIPLY(times_nnn, N, N, N)

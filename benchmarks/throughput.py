@@ -29,6 +29,8 @@ CHECKED = 2
 CASES = {"shared": False, "own": True}
 GOALS_US = {"shared": 0.12, "own": 0.6}
 GOAL_RATIO = 4.0
+LARGE_TILE = 64
+"""Runs a tile of the second way: a shared covariance leaves room in the cache for more runs."""
 DENSE_LANE_STEPS = 200_000
 """Filter steps of the dense path in one timed call, so that its matrices fit the memory."""
 
@@ -65,7 +67,7 @@ def lane_steps(matrices: Dense) -> int:
 
 
 def study_entry(
-    name: str, call: Callable[[], Statistics], matrices: Dense, unit: float = 1.0
+    name: str, spread: str, call: Callable[[], Statistics], matrices: Dense, unit: float = 1.0
 ) -> Entry:
     """Compare a Monte Carlo study of the bank with the oracle's mixture."""
     first = common.seconds(call)
@@ -75,7 +77,7 @@ def study_entry(
         expected = (truth.mean(axis=0), (truth**2).mean(axis=0), truth[-1])
         for label, value, reference in zip(rows._fields, rows, expected, strict=True):
             common.require_agreement(f"{name}, {label} of run {index}", value[index], reference)
-    return Entry(name, "devices", call, lane_steps(matrices), first)
+    return Entry(name, spread, call, lane_steps(matrices), first)
 
 
 def contestant_entries(contestant: Contestant, matrices: Dense) -> list[Entry]:
@@ -102,9 +104,12 @@ def line_up(steps: int, runs: int, own: bool) -> tuple[list[Entry], list[str]]:
     matrices = dense(problem, own)
     part = shortened(matrices, runs, DENSE_LANE_STEPS)
     entries = [
-        study_entry("jaxnav", structured(problem, own), matrices, ARCSEC),
-        study_entry("jaxnav, dense F", unstructured(part), part),
+        study_entry("jaxnav", "devices", structured(problem, own), matrices, ARCSEC),
+        study_entry("jaxnav, dense F", "devices", unstructured(part), part),
     ]
+    if runs >= common.DEVICES * LARGE_TILE:
+        wide = structured(problem, own, LARGE_TILE)
+        entries.append(study_entry("jaxnav", f"tiles of {LARGE_TILE}", wide, matrices, ARCSEC))
     notes = []
     for contestant in CONTESTANTS:
         try:

@@ -122,6 +122,7 @@ def test_noise_of_the_middle_third_is_ten_times_larger() -> None:
     np.testing.assert_array_equal(world.sample_scale, np.repeat([1.0, 10.0, 1.0], 1000))
 
 
+@pytest.mark.slow
 def test_open_loop_solution_drifts_by_the_drift() -> None:
     """After 60 s the misalignment is the initial one plus drift, which both chains show."""
     config = ImmaeConfig(duration_s=60.0, scenario="matched-noise")
@@ -137,6 +138,7 @@ def test_open_loop_solution_drifts_by_the_drift() -> None:
         assert abs(noise - 1.0) < 0.02
 
 
+@pytest.mark.slow
 def test_attitude_part_weighs_models_as_the_whole_state_does() -> None:
     config = ImmaeConfig(duration_s=40.0, scenario="noise-step")
     world = build_world(config)
@@ -163,6 +165,7 @@ def test_attitude_part_weighs_models_as_the_whole_state_does() -> None:
     np.testing.assert_allclose(np.exp(whole), np.exp(part), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_matched_filter_is_consistent_and_a_mistuned_one_is_not() -> None:
     """Full state, errors drawn from P0, the whole flight: NEES at twelve times."""
     runs, epochs = 100, np.arange(999, 12000, 1000)

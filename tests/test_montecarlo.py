@@ -15,6 +15,7 @@ from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.study import run_campaign
 
 
+@pytest.mark.slow
 def test_tiles_and_devices_do_not_change_a_run() -> None:
     config = ImmaeConfig(chain="linear", runs=16, duration_s=20.0)
     one, two = jax.local_devices()[:1], jax.local_devices()[:2]

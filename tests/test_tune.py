@@ -48,6 +48,7 @@ def test_fit_refuses_a_start_outside_the_domain_or_without_a_loss() -> None:
         fit(lambda p: p * jnp.nan, 1.0)
 
 
+@pytest.mark.slow
 def test_noise_wrong_by_four_is_found_again() -> None:
     """Sixteen flights of 100 s: one standard error of the factor is about 5.5 %."""
     config = ImmaeConfig(scenario="matched-noise", duration_s=100.0, initial="drawn")

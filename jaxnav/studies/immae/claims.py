@@ -30,7 +30,7 @@ PUBLISHED = {
 """RMSE of the attitude in arcsec; the paper shows one run."""
 
 SINGLE_RUN_SIGMAS = 1.96
-"""A published figure agrees if it is within this many deviations of a single run, its 95 % range."""
+"""A published figure agrees if it is within this many deviations of a single run (95 %)."""
 SETTLED = 0.9
 """Weight at which a model counts as chosen."""
 
@@ -103,7 +103,7 @@ def _level(campaign: Campaign, axis: str, printed: float) -> Claim:
         ci95=(value - half, value + half),
         verdict=verdict(agrees),
         why=f"the published single run is {printed - value:+.4f} arcsec from the mean, "
-        f"{'inside' if agrees else 'outside'} the 95 % range of a single run, which is the interval; "
+        f"{'inside' if agrees else 'outside'} the interval, the 95 % range of a single run; "
         "the paper gives neither trajectory nor discretisation",
     )
 
