@@ -7,7 +7,11 @@ import numpy as np
 from jaxnav.plotting import COLOURS, figure, plot_weights
 from jaxnav.studies.base import StudyResult
 
-SHOWN = {"matched-noise": ("kf", "immae"), "noise-step": ("kf", "mmae", "immae")}
+SHOWN = {
+    "matched-noise": {"kf": 0.6, "oracle": 1.2, "immae": 0.6},
+    "noise-step": {"kf": 0.6, "mmae": 0.6, "oracle": 1.2, "immae": 0.6},
+}
+"""Methods of the errors' figure with their line widths, from the back to the front."""
 NUMBERS = {"matched-noise": (3, 4), "noise-step": (5, 6)}
 
 
@@ -34,7 +38,7 @@ def draw(result: StudyResult, directory: Path) -> list[Path]:
 
 
 def _draw_errors(result: StudyResult, path: Path) -> None:
-    """One run: the errors of the three angles, and the oracle's, which few leave, above them."""
+    """One run: the errors of the three angles, and the envelope of the oracle's."""
     a = result.arrays
     methods = list(a["estimator"])
     oracle = methods.index("oracle")
@@ -42,9 +46,9 @@ def _draw_errors(result: StudyResult, path: Path) -> None:
     envelope = 3 * a["run_0_sigma"][:, oracle].max(axis=-1)
     with figure(path, (7.5, 7.5)) as drawing:
         for row, axes in enumerate(drawing.subplots(3, 1, sharex=True)):
-            for name in (*SHOWN[result.scenario], "oracle"):
+            for name, width in SHOWN[result.scenario].items():
                 error = a["run_0_error"][:, methods.index(name), row]
-                axes.plot(a["time"], error, color=COLOURS[name], label=name, lw=0.5)
+                axes.plot(a["time"], error, color=COLOURS[name], label=name, lw=width)
             axes.margins(x=0)
             for sign in (-1, 1):
                 label = "oracle 3 sigma" if sign > 0 else None
