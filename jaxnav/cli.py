@@ -6,6 +6,7 @@ Imports of JAX and the studies wait until a command needs them, so that help is 
 import os
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ commands:
   list          studies with their scenarios, filters, weight rules
   run STUDY     run a study; `jaxnav run STUDY --help` lists its parameters
   doctor        versions, devices, 64-bit floats, compilation cache
+
+`jaxnav --version` prints the version.
 
 exit codes: 0 done, 2 bad input, 3 some runs diverged, 130 interrupted
 """
@@ -47,6 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
+    if arguments == ["--version"]:
+        print(f"jaxnav {version('jaxnav')}")
+        return OK
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE, end="")
         return OK if arguments else BAD_INPUT
@@ -110,6 +116,7 @@ def _run(rest: list[str]) -> int:
     from jaxnav.report import Progress, print_json, print_result
     from jaxnav.results import claim_directory, write
 
+    study.load("check")(parsed.config)
     directory = claim_directory(parsed.out)
     with Progress(quiet=parsed.json) as progress:
         results: list[StudyResult] = study.load("entry")(parsed.config, progress)
@@ -137,10 +144,17 @@ def configure_jax() -> None:
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+        jax.config.update("jax_num_cpu_devices", _cores())
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "jaxnav" / "xla"))
+
+
+def _cores() -> int:
+    """Return the number of cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def entry() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 
 DPI = 150
@@ -36,6 +37,12 @@ def figure(path: Path, size: tuple[float, float], **layout: Any) -> Iterator[Fig
         made = Figure(figsize=size, layout="constrained", **layout)
         yield made
         made.savefig(path, dpi=DPI)
+
+
+def largest(values: np.ndarray) -> float:
+    """Return the largest finite magnitude, one if there is none: a limit for an axis."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(finite.max()) if finite.size and finite.max() > 0 else 1.0
 
 
 def plot_weights(axes: Any, time: Any, weights: Any, labels: Sequence[str]) -> None:

@@ -122,7 +122,8 @@ def _claim_table(claims: list[Claim]) -> Table:
         table.add_column(heading, justify=justify)
     colours = {"reproduced": "green", "not reproduced": "red"}
     for claim in claims:
-        interval = "" if claim.ci95 is None else f"{claim.ci95[0]:.4g} to {claim.ci95[1]:.4g}"
+        known = claim.ci95 is not None and claim.ci95[0] == claim.ci95[0]
+        interval = f"{claim.ci95[0]:.4g} to {claim.ci95[1]:.4g}" if claim.ci95 and known else ""
         colour = colours.get(claim.verdict, "yellow")
         table.add_row(
             escape(claim.text),

@@ -58,6 +58,18 @@ BAD = {
         ("run", "immae", "--reset-threshold", "1.5"),
         ("reset_threshold is 1.5", "(0, 1]"),
     ),
+    "threshold of zero": (
+        ("run", "immae", "--reset-threshold", "0"),
+        ("reset_threshold is 0.0", "(0, 1]"),
+    ),
+    "drift that is no number": (
+        ("run", "immae", "--gyro-drift-deg-h", "nan"),
+        ("gyro_drift_deg_h is nan", "finite"),
+    ),
+    "densities that repeat": (
+        ("run", "gnss-track", "--q", "1", "1"),
+        ("q is (1.0, 1.0)", "different"),
+    ),
     "period below a step": (
         ("run", "immae", "--reset-period-s", "0.01"),
         ("reset_period_s is 0.01", "at least one filter period of 0.05 s"),
@@ -76,11 +88,18 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input_gets_one_sentence(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_gets_one_sentence(
+    name: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
     arguments, words = BAD[name]
     said = refused(capsys, *arguments)
     for word in words:
         assert word in said
+    assert not list(tmp_path.iterdir())
 
 
 def test_directory_that_cannot_be_written(
@@ -180,6 +199,11 @@ def test_diverged_runs_are_reported_and_set_the_exit_code(
     assert document["methods"]["kf"]["diverged"] == 2
 
 
+def test_flight_of_half_a_second_is_drawn(tmp_path: Path) -> None:
+    assert main(["run", "immae", *TINY[:4], "--duration-s", "0.5", "--out", str(tmp_path)]) == OK
+    assert (tmp_path / "trmse.png").is_file()
+
+
 def test_interrupt_has_its_own_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,6 +216,8 @@ def test_interrupt_has_its_own_exit_code(
 
 
 def test_list_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == OK
+    assert capsys.readouterr().out.startswith("jaxnav 0.")
     assert main(["list"]) == OK
     said = capsys.readouterr().out
     for word in ("immae", "noise-step", "square_root_kf", "windowed_reset", ".pos"):

@@ -71,6 +71,14 @@ def test_log_without_velocity_is_not_scored_against_one(tmp_path: Path) -> None:
     assert np.isfinite(result.methods["mmae"]["log_likelihood"])
 
 
+def test_parked_log_has_no_error_at_all(tmp_path: Path) -> None:
+    row = "1 20 .01 .01 .01 0 0 0 0 0 0 0 0 .05 .05 .05 0 0 0"
+    lines = [f"2025/07/08 19:34:{k / 4:06.3f} 40.0 -105.0 1600.0 {row}" for k in range(80)]
+    (tmp_path / "parked.pos").write_text("\n".join(lines))
+    (result,) = run_study(GnssTrackConfig(log=tmp_path / "parked.pos"))
+    assert result.methods["kf-1"]["rmse"]["velocity"]["value"] == 0
+
+
 def test_clear_answers_to_what_cannot_be_run(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="log is not given"):
         run_study(GnssTrackConfig())

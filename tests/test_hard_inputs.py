@@ -9,10 +9,21 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.estimation.banks.mixture import BankParams, mmae
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.filters.square_root import square_root_kf
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Model, Obs, observed
+from jaxnav.estimation.types import (
+    Filter,
+    FilterParams,
+    Flag,
+    Gaussian,
+    Info,
+    Model,
+    Obs,
+    observed,
+    replicate,
+)
 
 BUILDERS = {"kf": kf, "square_root_kf": square_root_kf}
 each_filter = pytest.mark.parametrize("name", BUILDERS)
@@ -164,9 +175,31 @@ def test_perfect_knowledge_and_perfect_sensors(name: str) -> None:
         def moved(noise: Array) -> Array:
             model = params.model._replace(R=noise)
             estimate, info = one_update(name, params._replace(model=model), jnp.ones(1))
-            return jnp.sum(estimate.mean) + info.log_likelihood
+            return jnp.sum(estimate.mean) + jnp.maximum(info.log_likelihood, -1.0)
 
         assert np.all(np.isfinite(jax.grad(moved)(jnp.zeros(1))))
+
+
+@each_filter
+@pytest.mark.parametrize("broken", [-1e6, np.nan])
+def test_member_that_fails_leaves_the_bank_to_the_others(name: str, broken: float) -> None:
+    base = replicate(static(jnp.eye(2), jnp.ones(2), jnp.eye(2)), 2)
+    noise = base.model._replace(R=jnp.array([[1.0, 1.0], [broken, 1.0]]))
+    params = BankParams(base._replace(model=noise), ())
+    z = jnp.array(np.random.default_rng(0).normal(size=(10, 2)))
+    bank = mmae(FILTERS[name])
+    estimate, info = run(bank, params, jnp.zeros(10), observed(z)).record
+    alone = static(jnp.eye(2), jnp.ones(2), jnp.eye(2))
+    expected, _ = run(FILTERS[name], alone, jnp.zeros(10), observed(z)).record
+    np.testing.assert_allclose(estimate.mean, expected.mean, atol=1e-14)
+    np.testing.assert_allclose(estimate.cov, expected.cov, atol=1e-14)
+    assert np.all(np.isfinite(info.log_likelihood))
+
+
+def test_linear_filters_refuse_what_they_would_ignore() -> None:
+    for build in BUILDERS.values():
+        with pytest.raises(ValueError, match="its own retract"):
+            build(MODEL._replace(retract=lambda x, dx: x + 2 * dx))
 
 
 @each_filter

@@ -79,7 +79,9 @@ def test_claims_of_the_paper_at_full_size() -> None:
     for result in run_study(ImmaeConfig(scenario="all", chain="linear")):
         assert result.diverged == 0
         for claim in result.claims:
-            assert claim.verdict in ("reproduced", "not reproduced", "not testable")
+            # the level in yaw of simulation 1 is outside what one run scatters
+            beyond = (result.scenario, claim.id) == ("matched-noise", "immae-level-yaw")
+            assert claim.verdict == ("not reproduced" if beyond else "reproduced"), claim
             if claim.id.startswith("immae-beats"):
                 assert claim.ci95 is not None
                 assert claim.measured is not None
@@ -114,6 +116,12 @@ def test_published_improvements_are_those_the_paper_prints(short: list[StudyResu
     expected = {"yaw": -0.1018, "pitch": -0.2138, "roll": -0.1831}
     for axis, value in expected.items():
         assert abs(printed[f"immae-beats-kf-{axis}"] - value) < 5e-5
+
+
+def test_other_scenarios_than_the_papers_test_no_claim(short: list[StudyResult]) -> None:
+    for result in short:
+        assert {claim.verdict for claim in result.claims} == {"not testable"}
+        assert all("duration_s" in claim.why for claim in result.claims)
 
 
 def test_noise_of_the_middle_third_is_ten_times_larger() -> None:

@@ -44,6 +44,7 @@ ORDER = (
     "studies.immae.figures",
     "studies.gnss_track.config",
     "studies.gnss_track.study",
+    "studies.gnss_track.tuning",
     "studies.gnss_track.figures",
     "results",
     "options",

@@ -61,6 +61,13 @@ def test_a_failed_run_is_kept_as_a_row_and_left_out_of_the_sum() -> None:
     np.testing.assert_allclose(campaign.mean_curve, campaign.rows[~failed].mean(axis=0))
 
 
+def test_precision_of_the_caller_reaches_the_threads() -> None:
+    for wide, dtype in ((True, np.float64), (False, np.float32)):
+        with jax.enable_x64(wide):
+            campaign = monte_carlo(_noisy, jax.random.key(0), 3, jnp.zeros(()), tile=2)
+        assert campaign.rows.dtype == dtype
+
+
 def test_progress_counts_runs() -> None:
     seen: list[tuple[int, int]] = []
     monte_carlo(

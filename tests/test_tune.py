@@ -9,10 +9,10 @@ import optax
 import pytest
 
 from jaxnav.datasets import load_rtklib_pos
-from jaxnav.estimation.filters.kalman import kf
-from jaxnav.estimation.tune import POSITIVE, UNIT, fit, negative_log_likelihood
+from jaxnav.estimation.tune import POSITIVE, UNIT, fit
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
-from jaxnav.studies.gnss_track.study import MODEL, filter_params, track_data
+from jaxnav.studies.gnss_track.study import track_data
+from jaxnav.studies.gnss_track.tuning import density_loss
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.tuning import noise_loss
 
@@ -69,21 +69,8 @@ def test_density_fitted_on_the_first_half_predicts_the_second_better() -> None:
     config = GnssTrackConfig(log=DRIVE / "gnss_1934_sf.pos")
     data = track_data(config, load_rtklib_pos(DRIVE / "gnss_1934_sf.pos"))
     half = data.time.size // 2
-    filter = kf(MODEL)
-
-    def loss(density: jax.Array, part: slice) -> jax.Array:
-        inputs = jax.tree.map(lambda leaf: leaf[part], data.inputs)
-        observations = jax.tree.map(lambda leaf: leaf[part], data.observations)
-        params = filter_params(density, config, data)
-        start = data.observations.z[part][0]
-        initial = params.initial._replace(mean=jnp.concatenate([start, jnp.zeros(2)]))
-        return negative_log_likelihood(
-            filter, params._replace(initial=initial), inputs, observations
-        )
-
-    first, second = slice(0, half), slice(half, None)
-    found = fit(lambda q: loss(q, first), 10.0, steps=60)
+    found = fit(density_loss(config, data, slice(0, half)), 10.0, steps=60)
     # the first half prefers a density between the two best of the bank's models
     assert 0.1 < found.params < 1.0
-    hand_set = min(float(loss(jnp.array(q), second)) for q in config.q)
-    assert float(loss(found.params, second)) < hand_set
+    held_out = jax.jit(density_loss(config, data, slice(half, None)))
+    assert held_out(found.params) < min(held_out(jnp.array(q)) for q in config.q)

@@ -1,5 +1,6 @@
 """Measures of a study: errors with their standard error, and statistics of consistency."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -30,11 +31,13 @@ def rmse(mean_square: np.ndarray) -> Measured:
 
     The standard error follows from that of the mean square by the derivative of the root.
     """
-    mean = float(np.mean(mean_square))
-    value = float(np.sqrt(mean))
-    if mean_square.size < 2 or value == 0:
-        return Measured(value, float("nan"))
-    return Measured(value, float(_se(mean_square) / (2 * value)))
+    return root(float(np.mean(mean_square)), _se(mean_square))
+
+
+def root(mean_square: float, se: float) -> Measured:
+    """Return the root of a mean square and its standard error, by the derivative of the root."""
+    value = math.sqrt(mean_square)
+    return Measured(value, se / (2 * value) if value > 0 else math.nan)
 
 
 def rmse_ratio(
@@ -69,6 +72,8 @@ def mean_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
 
 
 def _se(values: np.ndarray) -> float:
+    if values.size < 2:
+        return math.nan
     return float(np.std(values, ddof=1) / np.sqrt(values.size))
 
 

@@ -36,7 +36,7 @@ class Campaign(NamedTuple):
 
     Attributes:
         rows: Each leaf with a leading axis of runs, in order of the run's index.
-        curve: The sum over the runs that are finite.
+        curve: The sum over the runs whose rows are finite in every entry.
         traces: Each leaf with a leading axis of the runs that were kept.
         finite: ``(runs,)`` whether every entry of a run's row is finite.
     """
@@ -100,10 +100,13 @@ def monte_carlo(
     total: Any = None
     traces: list[Any] = []
 
+    # A thread does not inherit the precision that a context manager has set for its caller.
+    wide = jnp.result_type(float) == jnp.float64
+
     def compute(start: int, place: int) -> tuple[RunOutput, Array]:
-        return jax.block_until_ready(
-            _run_tile(run_one, tile, keep > 0, np.int32(start + place * tile), *inputs[place])
-        )
+        first = np.int32(start + place * tile)
+        with jax.enable_x64(wide):
+            return jax.block_until_ready(_run_tile(run_one, tile, keep > 0, first, *inputs[place]))
 
     with ThreadPoolExecutor(len(chosen)) as pool:
         for start in range(0, runs, stride):

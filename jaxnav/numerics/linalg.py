@@ -146,9 +146,11 @@ def semidefinite_root(A: Array) -> Array:
     Columns whose pivot is not positive are zero, so covariances with states that carry no noise are
     factored; the gradient with respect to such a zero pivot is zero. The diagonal is raised by
     ``2 n`` rounding errors first: without that, a matrix that is singular to rounding loses its
-    digits in the elimination (2e-3 relative at n = 15).
+    digits in the elimination (2e-3 relative at n = 15). A variance that is negative or not a number
+    makes the result NaN.
     """
     n = A.shape[0]
+    sound = jnp.all(jnp.diag(A) >= 0)
     A = A + 2 * n * jnp.finfo(A.dtype).eps * jnp.diag(jnp.diag(A))
     rows = jnp.arange(n)
     columns: list[Array] = []
@@ -158,4 +160,4 @@ def semidefinite_root(A: Array) -> Array:
         column = jnp.where(good & (rows >= j), A[:, j] / root, 0)
         A = A - column[:, None] * column[None, :]
         columns.append(column)
-    return jnp.stack(columns, axis=1)
+    return jnp.where(sound, jnp.stack(columns, axis=1), jnp.nan)

@@ -16,6 +16,8 @@ class Study(NamedTuple):
         entry: ``module:function`` with ``(config, progress) -> list[StudyResult]``.
         figures: ``module:function`` with ``(result, directory) -> list[Path]``.
         scenarios: ``module:mapping`` from scenario to one line, free of JAX.
+        check: ``module:function`` with ``(config)`` that raises what the study would refuse, before
+            anything is written.
     """
 
     summary: str
@@ -23,6 +25,7 @@ class Study(NamedTuple):
     entry: str
     figures: str
     scenarios: str
+    check: str
 
     def load(self, part: str) -> Any:
         """Return the object that one of the fields names."""
@@ -37,6 +40,7 @@ STUDIES = {
         entry="jaxnav.studies.immae.study:run_study",
         figures="jaxnav.studies.immae.figures:draw",
         scenarios="jaxnav.studies.immae.config:SCENARIOS",
+        check="jaxnav.studies.immae.study:check",
     ),
     "gnss-track": Study(
         summary="a recorded GNSS track through the same bank, judged by predictive likelihood",
@@ -44,5 +48,6 @@ STUDIES = {
         entry="jaxnav.studies.gnss_track.study:run_study",
         figures="jaxnav.studies.gnss_track.figures:draw",
         scenarios="jaxnav.studies.gnss_track.config:SCENARIOS",
+        check="jaxnav.studies.gnss_track.study:check",
     ),
 }

@@ -1,5 +1,6 @@
 """What every study is: scenarios of a configuration, a result, claims and their verdicts."""
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any, get_args
 
@@ -30,6 +31,14 @@ def require_positive(config: Any, *names: str) -> None:
         accepted = "positive in one entry or more" if isinstance(value, tuple) else "positive"
         good = len(entries) > 0 and all(0 < entry < float("inf") for entry in entries)
         require(good, name, value, accepted)
+
+
+def require_finite(config: Any) -> None:
+    """Require that every number of a configuration is finite."""
+    for name, value in plain(config).items():
+        for entry in value if isinstance(value, tuple) else (value,):
+            if isinstance(entry, float):
+                require(math.isfinite(entry), name, value, "finite")
 
 
 def require_x64() -> None:

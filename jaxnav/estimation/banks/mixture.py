@@ -113,7 +113,9 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
     """Return the bank of ``filter`` under one weight rule, with parameters :class:`BankParams`.
 
     The estimate is the moment-matched mixture: the members' covariances and the spread of their
-    means, weighted. The info's log-likelihood is that of the predictive mixture.
+    means, weighted. The info's log-likelihood is that of the predictive mixture. A member whose
+    update fails, or whose likelihood is not a number, is ruled out and leaves the others as they
+    are.
 
     References:
         Si, Wang, Niu, Eqs. (4)-(18). Zhao et al. (2018), Eqs. (5) and (30), leave the members'
@@ -204,8 +206,9 @@ def mixture_info(log_weights: Array, info: Info) -> Info:
     The log-likelihood is the mixture's, ``log sum w_i N(nu_i; 0, S_i)``; innovation, its covariance
     and the NIS are those of the moment-matched prediction.
     """
-    evidence = jax.nn.logsumexp(log_weights + member_log_likelihood(info.log_likelihood))
-    vetoed = ~jnp.isfinite(evidence)
+    joint = log_weights + member_log_likelihood(info.log_likelihood)
+    vetoed = ~jnp.any(active(joint))
+    evidence = jax.nn.logsumexp(jnp.where(vetoed, 0, joint))
     innovation, S = moment_match(log_weights, Gaussian(info.innovation, info.innovation_cov))
     root = cholesky(symmetrise(S))
     whitened = solve_lower(root.factor, innovation)

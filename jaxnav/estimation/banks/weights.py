@@ -18,8 +18,8 @@ from jaxnav.estimation.types import Info, WeightRule
 def normalise(log_weights: Array) -> Array:
     """Return log-weights ``(M,)`` whose weights sum to one; all ``-inf`` stays as it is."""
     shifted = from_peak(log_weights)
-    total = jax.nn.logsumexp(shifted)
-    return shifted - jnp.where(jnp.isfinite(total), total, 0)
+    some = jnp.any(active(shifted))
+    return shifted - jnp.where(some, jax.nn.logsumexp(jnp.where(some, shifted, 0)), 0)
 
 
 def from_peak(values: Array) -> Array:

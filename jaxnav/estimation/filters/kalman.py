@@ -45,7 +45,10 @@ def kf(model: Model) -> Filter:
 
     ``transition`` and ``observe`` may have an offset that does not depend on the state. Channels
     that are not valid have no effect. An innovation covariance that is not positive definite skips
-    the update and raises a flag.
+    the update, raises a flag, and has a log-likelihood of ``-inf``.
+
+    Raises:
+        ValueError: If the model has a ``retract``, ``local`` or ``jacobians`` of its own.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-7 for a
     ratio of measurement to prior sigma of 1e-6 in float64, to 1e-3 for 1e-2 in float32; beyond
@@ -56,6 +59,7 @@ def kf(model: Model) -> Filter:
         Si, Wang, Niu, "High precision attitude estimation algorithm for SINS/CNS integrated
         navigation with unknown noise characteristics", Eqs. (7)-(13); Bucy and Joseph (1968).
     """
+    require_vector_space(model)
 
     def init(params: FilterParams) -> KalmanState:
         return KalmanState(*params.initial)
@@ -87,6 +91,17 @@ def kf(model: Model) -> Filter:
         return Gaussian(state.x, symmetrise(state.P))
 
     return Filter(init, predict, update, estimate)
+
+
+def require_vector_space(model: Model) -> None:
+    """Raise ``ValueError`` if a model has slots that the linear filters do not use."""
+    unused = ("retract", "local", "jacobians")
+    own = [name for name in unused if getattr(model, name) is not Model._field_defaults[name]]
+    if own:
+        raise ValueError(
+            f"the model has its own {', '.join(own)}; a linear filter takes models with a vector "
+            "as state and no Jacobians"
+        )
 
 
 def tangent_map(
@@ -129,7 +144,7 @@ def innovation_info(nu: Array, S: Array, root: Cholesky, valid: Array) -> Info:
     return Info(
         innovation=nu,
         innovation_cov=S,
-        log_likelihood=jnp.where(usable, log_likelihood, 0),
+        log_likelihood=jnp.where(usable, log_likelihood, -jnp.inf),
         nis=nis,
         iterations=jnp.ones((), jnp.int32),
         flags=_flags(valid, usable, few_digits),

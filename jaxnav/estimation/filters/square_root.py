@@ -9,6 +9,7 @@ from jaxnav.estimation.filters.kalman import (
     innovation_info,
     mask_noise,
     masked_innovation,
+    require_vector_space,
     tangent_map,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
@@ -29,9 +30,9 @@ def square_root_kf(model: Model) -> Filter:
         [sqrt(R), H L-; 0, L-] Theta = [sqrt(S), 0; K sqrt(S), L]
 
     with ``Theta`` orthogonal. Parameters, offsets and invalid channels are as in
-    :func:`~jaxnav.estimation.filters.kalman.kf`. ``P``, ``Q`` and ``R`` may be singular; gradients
-    need ``[Phi L, sqrt(Q)]`` of full row rank. Costs about twenty times the Joseph form, since
-    each step holds two QR factorisations.
+    :func:`~jaxnav.estimation.filters.kalman.kf`, and so are the errors raised. ``P``, ``Q`` and
+    ``R`` may be singular; gradients need ``[Phi L, sqrt(Q)]`` of full row rank. The two QR
+    factorisations of a step cost far more than the Joseph form does.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
     ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32.
@@ -39,6 +40,7 @@ def square_root_kf(model: Model) -> Filter:
     References:
         Kailath, Sayed, Hassibi (2000), Linear Estimation, section 12.3.
     """
+    require_vector_space(model)
 
     def init(params: FilterParams) -> SquareRootState:
         return SquareRootState(params.initial.mean, semidefinite_root(params.initial.cov))

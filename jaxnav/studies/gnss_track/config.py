@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from jaxnav.studies.base import require, require_choice, require_positive
+from jaxnav.studies.base import require, require_choice, require_finite, require_positive
 
 SCENARIOS = {
     "full-rate": "every fix of the log",
@@ -50,10 +50,13 @@ class GnssTrackConfig:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
         require_choice(self, "scenario")
+        require_finite(self)
         require_positive(
             self, "thin_period_s", "position_sigma", "initial_speed_sigma", "reset_period_s"
         )
         require_positive(self, "q")
+        names = self.single_ids
+        require(len(set(names)) == len(names), "q", self.q, "different in every entry")
         require(0 < self.reset_threshold <= 1, "reset_threshold", self.reset_threshold, "in (0, 1]")
         require(
             0 < self.weight_floor < 1 / len(self.q),
@@ -62,3 +65,8 @@ class GnssTrackConfig:
             f"positive and below 1 / {len(self.q)}, the equal weight",
         )
         require(0 < self.switching < 1, "switching", self.switching, "between 0 and 1")
+
+    @property
+    def single_ids(self) -> tuple[str, ...]:
+        """Method ids of the single filters."""
+        return tuple(f"kf-{q:g}" for q in self.q)

@@ -25,14 +25,14 @@ def draw(result: StudyResult, directory: Path) -> list[Path]:
     return paths
 
 
-def _best(result: StudyResult) -> str:
+def _best(result: StudyResult, among: list[str]) -> str:
     """The method with the highest predictive likelihood."""
-    return max(result.methods, key=lambda name: result.methods[name]["log_likelihood"])
+    return max(among, key=lambda name: result.methods[name]["log_likelihood"])
 
 
 def _draw_track(result: StudyResult, path: Path) -> None:
     a = result.arrays
-    best = _best(result)
+    best = _best(result, list(result.methods))
     estimate = a["estimate"][:, list(a["estimator"]).index(best)]
     with figure(path, (6.5, 6)) as drawing:
         axes = drawing.subplots()
@@ -47,16 +47,15 @@ def _draw_track(result: StudyResult, path: Path) -> None:
 
 
 def _draw_speed(result: StudyResult, path: Path) -> None:
-    """Speed over time, and its difference from the receiver's Doppler speed."""
+    """Speed of the best single filter and of a bank, and the difference from the Doppler speed."""
     a = result.arrays
     methods = list(a["estimator"])
     doppler = np.linalg.norm(a["doppler"], axis=-1)
-    singles = [name for name in methods if name.startswith("kf-")]
-    least = min(singles, key=lambda name: result.methods[name]["log_likelihood"])
+    single = _best(result, [name for name in methods if name.startswith("kf-")])
     with figure(path, (9, 5)) as drawing:
         above, below = drawing.subplots(2, 1, sharex=True)
         above.plot(a["time"], doppler, color="0.6", lw=2, label="receiver's Doppler")
-        for name, colour in ((least, COLOURS["kf"]), ("markov", COLOURS["markov"])):
+        for name, colour in ((single, COLOURS["kf"]), ("markov", COLOURS["markov"])):
             speed = np.linalg.norm(a["estimate"][:, methods.index(name), 2:], axis=-1)
             above.plot(a["time"], speed, color=colour, lw=0.8, label=name)
             below.plot(a["time"], speed - doppler, color=colour, lw=0.6, label=name)

@@ -21,6 +21,7 @@ from jaxnav.estimation.banks.weights import (
     windowed_reset,
 )
 from jaxnav.estimation.filters.kalman import kf
+from jaxnav.estimation.metrics import root
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, Obs, WeightRule, replicate
 from jaxnav.navigation.earth import enu_from_geodetic
@@ -77,10 +78,7 @@ def run_study(
         ConfigError: If no log is given, or 64-bit floats are off.
         DataError: If the log is malformed or too short.
     """
-    require_x64()
-    if config.log is None:
-        raise ConfigError("log is not given; it must be the path of an RTKLIB .pos file (--log)")
-    track = load_rtklib_pos(config.log)
+    track = _load(config)
     names = tuple(SCENARIOS) if config.scenario == "all" else (config.scenario,)
     results = []
     for name in names:
@@ -88,6 +86,21 @@ def run_study(
         if progress is not None:
             progress(name, 1, 1)
     return results
+
+
+def check(config: GnssTrackConfig) -> None:
+    """Raise what :func:`run_study` would: :class:`ConfigError` or :class:`DataError`."""
+    track = _load(config)
+    for name in SCENARIOS if config.scenario == "all" else (config.scenario,):
+        scenario = replace(config, scenario=name)
+        panel_params(scenario, track_data(scenario, track))
+
+
+def _load(config: GnssTrackConfig) -> GnssTrack:
+    require_x64()
+    if config.log is None:
+        raise ConfigError("log is not given; it must be the path of an RTKLIB .pos file (--log)")
+    return load_rtklib_pos(config.log)
 
 
 def track_data(config: GnssTrackConfig, track: GnssTrack) -> TrackData:
@@ -122,11 +135,6 @@ def filter_params(density: Array | float, config: GnssTrackConfig, data: TrackDa
     return FilterParams(model, data.initial)
 
 
-def single_ids(config: GnssTrackConfig) -> tuple[str, ...]:
-    """Return the method ids of the single filters."""
-    return tuple(f"kf-{q:g}" for q in config.q)
-
-
 def panel_params(config: GnssTrackConfig, data: TrackData) -> BankParams:
     """Return the parameters of all methods over one set of members."""
     count = len(config.q)
@@ -145,7 +153,7 @@ def panel_params(config: GnssTrackConfig, data: TrackData) -> BankParams:
         "markov": (jnp.array(config.switching), ()),
     }
     priors: dict[str, Array | None] = dict.fromkeys(rules)
-    for j, name in enumerate(single_ids(config)):
+    for j, name in enumerate(config.single_ids):
         rules[name] = ()
         priors[name] = jnp.where(jnp.arange(count) == j, 0.0, -jnp.inf)
     return BankParams(members, rules, priors)
@@ -153,7 +161,7 @@ def panel_params(config: GnssTrackConfig, data: TrackData) -> BankParams:
 
 def _run_scenario(config: GnssTrackConfig, track: GnssTrack) -> StudyResult:
     data = track_data(config, track)
-    rules = {**dict.fromkeys(single_ids(config), fixed()), **BANKS}
+    rules = {**dict.fromkeys(config.single_ids, fixed()), **BANKS}
     comparison = panel(kf(MODEL), rules)
 
     def record(state: Any, info: Any) -> tuple[Array, Array, Array]:
@@ -225,9 +233,8 @@ def _measures(
         }
         if data.velocity is not None:
             square = np.sum((mean[:, i, 2:] - data.velocity) ** 2, axis=-1)
-            value = float(np.sqrt(square.mean()))
-            se = _block_se(square) / (2 * value)
-            entry["rmse"] = {"velocity": {"value": value, "se": se, "unit": "m/s"}}
+            velocity = root(float(square.mean()), _block_se(square))
+            entry["rmse"] = {"velocity": {**velocity._asdict(), "unit": "m/s"}}
         measures[name] = entry
     return measures
 
@@ -254,6 +261,12 @@ def _notes(config: GnssTrackConfig, track: GnssTrack, data: TrackData) -> list[s
         longest = float(np.max(steps[missing - 1]))
         notes.append(
             f"{missing.size} gaps in the log, the longest {longest:g} s, were predicted over."
+        )
+    coarse = int(np.sum(track.quality != 1))
+    if coarse:
+        notes.append(
+            f"{coarse} of {track.quality.size} fixes are not RTK-fixed (Q is not 1) and are used "
+            f"with the same sigma of {config.position_sigma:g} m."
         )
     if data.velocity is None:
         notes.append("The log has no velocity: the estimates are not scored against one.")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxnav.studies.base import require, require_choice, require_positive
+from jaxnav.studies.base import require, require_choice, require_finite, require_positive
 
 SCENARIOS = {
     "matched-noise": "simulation 1: true noise Q0 throughout, single Kalman filter at 4 Q0",
@@ -86,6 +86,7 @@ class ImmaeConfig:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
         require_choice(self, "scenario", "chain", "initial")
+        require_finite(self)
         require(self.runs >= 1, "runs", self.runs, "at least 1")
         require(0 <= self.seed < 2**63, "seed", self.seed, "between 0 and 2**63 - 1")
         require_positive(self, *_POSITIVE)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav.plotting import COLOURS, figure, plot_weights
+from jaxnav.plotting import COLOURS, figure, largest, plot_weights
 from jaxnav.studies.base import StudyResult
 
 SHOWN = {
@@ -53,7 +53,7 @@ def _draw_errors(result: StudyResult, path: Path) -> None:
             for sign in (-1, 1):
                 label = "oracle 3 sigma" if sign > 0 else None
                 axes.plot(a["time"], sign * envelope, color="0.4", ls="--", lw=0.8, label=label)
-            limit = 1.15 * np.max(np.abs(a["run_0_error"][len(a["time"]) // 20 :, :, row]))
+            limit = 1.15 * largest(a["run_0_error"][len(a["time"]) // 20 :, :, row])
             axes.set_ylim(-limit, limit)
             axes.set_ylabel(f"{a['axis'][row]} error [arcsec]")
         drawing.axes[0].legend(ncols=5, loc="upper center")
@@ -82,7 +82,7 @@ def _draw_trmse(result: StudyResult, path: Path) -> None:
     """The RMSE over runs at each second, mean of the three angles, for every method."""
     a = result.arrays
     square = np.mean(a["trmse"] ** 2, axis=-1)
-    steps = max(1, round(1 / float(a["time"][0])))
+    steps = min(max(1, round(1 / float(a["time"][0]))), len(square))
     whole = len(square) // steps * steps
     seconds = np.sqrt(square[:whole].reshape(-1, steps, square.shape[1]).mean(axis=1))
     with figure(path, (7.5, 4)) as drawing:
@@ -92,7 +92,7 @@ def _draw_trmse(result: StudyResult, path: Path) -> None:
                 a["time"][steps - 1 : whole : steps], seconds[:, i], color=COLOURS[name], label=name
             )
         axes.margins(x=0)
-        axes.set_ylim(0, 1.3 * float(np.max(seconds[len(seconds) // 20 :])))
+        axes.set_ylim(0, 1.3 * largest(seconds[len(seconds) // 20 :]))
         axes.set_xlabel("time [s]")
         axes.set_ylabel("attitude RMSE over runs [arcsec]")
         axes.legend(ncols=6, loc="upper center")

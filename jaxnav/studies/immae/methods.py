@@ -27,7 +27,14 @@ from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.montecarlo import RunOutput
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs, WeightRule
+from jaxnav.estimation.types import (
+    Filter,
+    FilterParams,
+    Gaussian,
+    Obs,
+    WeightRule,
+    replicate,
+)
 from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsInput, SinsCnsParams, sins_cns
 from jaxnav.numerics.lie import so3_left_jacobian
 from jaxnav.studies.immae.config import ImmaeConfig
@@ -43,6 +50,7 @@ RULES: dict[str, WeightRule] = {
 }
 METHODS = tuple(RULES)
 BANKS = ("mmae", "immae", "floor", "markov")
+AXES = ("yaw", "pitch", "roll")
 DIVERGED_SIGMAS = 5.0
 """A method diverged in a run whose final attitude error exceeds this many star-tracker sigmas."""
 
@@ -69,9 +77,9 @@ class Row(NamedTuple):
         mean_square: ``(methods, 3) [rad^2]`` of the errors of yaw, pitch, roll over the flight.
         nees: ``(methods,)`` time average of the attitude's NEES (three degrees of freedom).
         final_error: ``(methods,) [rad]`` norm of the attitude error at the end.
-        crossing: Step at which the MMAE first prefers the second model to the first in or after
-            the middle third; the number of steps if never.
-        returned: Whether the MMAE prefers the first model again at the end.
+        crossing: Step, counted from 1, at which the MMAE first prefers the second model to the
+            first in or after the middle third; the number of steps if never.
+        returned: Whether the MMAE then prefers the first model again at the end.
     """
 
     mean_square: Array
@@ -95,14 +103,11 @@ def panel_params(config: ImmaeConfig) -> BankParams:
     """Return the parameters of the panel: models, single filter and informed filter."""
     theta = jnp.array([*config.theta, config.single_theta, 1.0])
     count = theta.shape[0]
-    noise, sigma = noise_of(config), prior_sigma(config)
-
-    def every(leaf: Array) -> Array:
-        return jnp.broadcast_to(leaf, (count, *leaf.shape))
-
+    initial = Gaussian(jnp.zeros(15), jnp.diag(prior_sigma(config) ** 2))
+    same = replicate(FilterParams(noise_of(config), initial), count)
     members = Member(
-        model=jax.tree.map(every, noise)._replace(noise_scale=theta),
-        initial=Gaussian(jnp.zeros((count, 15)), every(jnp.diag(sigma**2))),
+        model=same.model._replace(noise_scale=theta),
+        initial=same.initial,
         told=jnp.arange(count) == count - 1,
     )
     period = config.reset_period_s / config.filter_period_s
@@ -186,6 +191,6 @@ def _row(error: Array, consistency: Array, weights: Array) -> Row:
         mean_square=jnp.mean(error**2, axis=0),
         nees=jnp.mean(consistency, axis=0),
         final_error=jnp.sqrt(jnp.sum(error[-1] ** 2, axis=-1)),
-        crossing=jnp.where(jnp.any(prefers), jnp.argmax(prefers), steps),
-        returned=mmae[-1, 0] >= mmae[-1, second],
+        crossing=jnp.where(jnp.any(prefers), jnp.argmax(prefers) + 1, steps),
+        returned=jnp.any(prefers) & (mmae[-1, 0] >= mmae[-1, second]),
     )

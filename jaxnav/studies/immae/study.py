@@ -13,6 +13,7 @@ from jaxnav.studies.base import StudyResult, plain, require_x64
 from jaxnav.studies.immae.claims import PUBLISHED, assess
 from jaxnav.studies.immae.config import SCENARIOS, ImmaeConfig
 from jaxnav.studies.immae.methods import (
+    AXES,
     BANKS,
     DIVERGED_SIGMAS,
     METHODS,
@@ -22,8 +23,6 @@ from jaxnav.studies.immae.methods import (
 )
 from jaxnav.studies.immae.simulation import build_world
 from jaxnav.units import ARCSEC
-
-AXES = ("yaw", "pitch", "roll")
 
 
 def run_study(
@@ -41,9 +40,15 @@ def run_study(
     Raises:
         ConfigError: If 64-bit floats are off.
     """
-    require_x64()
+    check(config)
     names = tuple(SCENARIOS) if config.scenario == "all" else (config.scenario,)
     return [_run_scenario(replace(config, scenario=name), progress) for name in names]
+
+
+def check(config: ImmaeConfig) -> None:
+    """Raise :class:`ConfigError` if the study cannot run here; the configuration checks itself."""
+    del config
+    require_x64()
 
 
 def _run_scenario(
