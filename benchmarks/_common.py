@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import platform
 import resource
 import sys
@@ -64,6 +65,36 @@ def best_in_turn(calls: Sequence[Callable[[], Any]], turns: int) -> list[float]:
     """Return the best seconds of each call; they take turns, so a busy moment hits them alike."""
     times = [[seconds(call) for call in calls] for _ in range(turns)]
     return [min(column) for column in zip(*times, strict=True)]
+
+
+class Moment(NamedTuple):
+    """Wall time, CPU time of all processes (``None`` where it is not told) and of this one [s]."""
+
+    wall: float
+    everyone: float | None
+    own: float
+
+
+def now() -> Moment:
+    """Return the readings that :func:`cores_elsewhere` compares."""
+    try:
+        user, nice, system = Path("/proc/stat").read_text().split(maxsplit=4)[1:4]
+        everyone = (int(user) + int(nice) + int(system)) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError):
+        everyone = None
+    return Moment(time.perf_counter(), everyone, time.process_time())
+
+
+def cores_elsewhere(start: Moment) -> list[str]:
+    """Return a note if others kept a tenth of a core or more busy since ``start``."""
+    end = now()
+    if start.everyone is None or end.everyone is None:
+        return []
+    others = end.everyone - start.everyone - (end.own - start.own)
+    cores = others / (end.wall - start.wall)
+    if cores < 0.1:
+        return []
+    return [f"Other processes kept {cores:.1f} cores busy meanwhile: figures on all cores suffer."]
 
 
 def peak_gib() -> float:

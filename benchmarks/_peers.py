@@ -241,5 +241,5 @@ CONTESTANTS = (
     Contestant("cuthbert", 20_000, jax_calls(cuthbert_series), jax=True),
     Contestant("NumPy, batched", 50_000, prepare_numpy),
     Contestant("filterpy, one run", 2_500, prepare_filterpy, runs=1),
-    Contestant("C, dense, one core", 200_000, prepare_c),
+    Contestant("C, dense", 200_000, prepare_c),
 )

@@ -119,9 +119,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     common.setup()
     problem = make_problem(STEPS, RUNS)
     expected = oracle(dense(problem, own=False), 0)
+    start = common.now()
     rows = [measure(name, case, problem, expected) for name, case in cases(problem).items()]
+    notes = common.cores_elsewhere(start)
     title = f"Seconds until a run of {RUNS} at once can start"
-    return common.report(args, title, rows)
+    return common.report(args, title, rows, notes=notes)
 
 
 if __name__ == "__main__":

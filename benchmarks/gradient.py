@@ -134,11 +134,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     args = common.arguments(__doc__, argv)
     common.setup()
     steps, turns = (2000, 2) if args.quick else (12000, 4)
+    start = common.now()
     rows = [measure(name, steps, turns) for name in FILTERS]
+    notes = common.cores_elsewhere(start)
     goals = [common.Goal(f"ratio, {row['filter']}", row["ratio"], GOAL_RATIO) for row in rows]
     goals.append(common.Goal("peak memory, GiB", common.peak_gib(), GOAL_GIB))
     title = f"Value and gradient of the log-likelihood, {steps} steps, {RUNS} runs"
-    return common.report(args, title, rows, goals)
+    return common.report(args, title, rows, goals, notes)
 
 
 if __name__ == "__main__":

@@ -72,9 +72,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     config = ImmaeConfig(chain="linear", duration_s=100.0 if args.quick else 600.0)
     world = jax.block_until_ready(build_world(config))
     check(config, world)
+    start = common.now()
     rows = [measure(config, world, runs, 2) for runs in (QUICK_RUNS if args.quick else RUNS)]
     growth = np.ptp([row["peak memory so far, GiB"] for row in rows])
-    notes = [f"From the smallest to the largest number of runs the peak grew by {growth:.2f} GiB."]
+    notes = common.cores_elsewhere(start)
+    notes += [f"From the smallest to the largest number of runs the peak grew by {growth:.2f} GiB."]
     title = f"The study immae, linear form, {config.steps} steps"
     return common.report(args, title, rows, notes=notes)
 

@@ -120,9 +120,11 @@ def line_up(steps: int, runs: int, own: bool) -> tuple[list[Entry], list[str]]:
 
 
 def measure(steps: int, runs: int, case: str, turns: int) -> tuple[list[dict], list[str]]:
-    """Return the rows of the table for one case, the fastest way of each contestant."""
+    """Return the rows of the table for one case, the fastest way of each contestant, and notes."""
     entries, notes = line_up(steps, runs, CASES[case])
+    start = common.now()
     best = common.best_in_turn([entry.call for entry in entries], turns)
+    notes += [f"Covariance {case}, {runs} runs: {note}" for note in common.cores_elsewhere(start)]
     fastest: dict[str, dict[str, Any]] = {}
     for entry, seconds in zip(entries, best, strict=True):
         us = 1e6 * seconds / entry.lane_steps

@@ -66,6 +66,8 @@ def kf(model: Model) -> Filter:
 
     def predict(params: FilterParams, state: KalmanState, u: Input) -> KalmanState:
         x, push = tangent_map(lambda x: model.transition(params.model, x, u), state.x)
+        # Without the barrier the update computes the predicted mean anew wherever it is used.
+        x = jax.lax.optimization_barrier(x)
         P = push(push(state.P).T)
         return KalmanState(x, symmetrise(P) + model.process_noise(params.model, state.x, u))
 
@@ -75,15 +77,16 @@ def kf(model: Model) -> Filter:
         z_pred, push = tangent_map(lambda x: model.observe(params.model, x, u), state.x)
         nu = masked_innovation(model, obs, z_pred)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
-        observed = obs.valid[:, None]
-        HP = jnp.where(observed, push(state.P), 0)
-        S = jnp.where(observed, push(HP.T), 0) + R
+        HP = push(state.P)
+        S = jnp.where(obs.valid[:, None] & obs.valid[None], push(HP.T), 0) + R
         root = cholesky(S)
         gain = solve_lower_transposed(root.factor, solve_lower(root.factor, HP))
-        gain = jnp.where(root.positive_definite, gain, 0)
-        # Without the barrier XLA solves again for each of the n^2 entries that use the gain.
+        # S does not couple valid channels with invalid ones, so a zero gain is all that these need;
+        # masks in the products below would keep the compiler from vectorising them. Without the
+        # barrier XLA solves again for each of the n^2 entries that use the gain.
+        gain = jnp.where(obs.valid[:, None] & root.positive_definite, gain, 0)
         gain = jax.lax.optimization_barrier(gain)
-        HA = jnp.where(observed, push(state.P - matmul(HP.T, gain)), 0)
+        HA = push(state.P - matmul(HP.T, gain))
         P = state.P - matmul(gain.T, HP) + matmul((matmul(R, gain) - HA).T, gain)
         return KalmanState(state.x + matmul(gain.T, nu), P), innovation_info(nu, S, root, obs.valid)
 

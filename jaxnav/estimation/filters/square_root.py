@@ -34,6 +34,9 @@ def square_root_kf(model: Model) -> Filter:
     ``R`` may be singular; gradients need ``[Phi L, sqrt(Q)]`` of full row rank. The two QR
     factorisations of a step cost far more than the Joseph form does.
 
+    Batched QR of several host devices at once can wait for ever inside XLA: give ``monte_carlo``
+    one device, or set the environment variable ``NPROC`` to 4 or more before JAX starts.
+
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
     ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32.
 
