@@ -193,6 +193,67 @@ def test_euler_errors_of_a_small_rotation():
             np.testing.assert_allclose(m[:, k], numeric, rtol=1e-10, atol=1e-10)
 
 
+def closed_error_map(pitch, yaw, roll):
+    """Return the small rotation in inertial axes per Euler-angle error: Eq. (38) as meant."""
+    cp, sp, cy, sy = np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    return np.array([[0, -sp, cp * cy], [0, cp, sp * cy], [1, 0, -sy]])
+
+
+def closed_rate_map(pitch, yaw, roll):
+    """Return the body rate per Euler-angle rate: Eq. (35) with its element (3, 1) corrected."""
+    cy, sy, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
+    return np.array([[-sy, 0, 1], [sr * cy, cr, 0], [cr * cy, -sr, 0]])
+
+
+def test_euler_maps_are_those_of_the_paper_as_meant():
+    angles = random_angles(200)
+    C = np.array([rotations.dcm(*a) for a in angles])
+    M = np.asarray(jax.jit(jax.vmap(lie.euler_error_from_rotation))(C))
+    W = np.asarray(jax.jit(jax.vmap(lie.body_rate_from_euler_rate))(*angles.T))
+    inverse_of_m = np.array([closed_error_map(*a) for a in angles])
+    one = np.broadcast_to(np.eye(3), M.shape)
+    np.testing.assert_allclose(M @ inverse_of_m, one, rtol=0, atol=2e-15)
+    np.testing.assert_allclose(W, [closed_rate_map(*a) for a in angles], rtol=0, atol=1e-15)
+    # One rotation seen from either side: C W = inv(M).
+    np.testing.assert_allclose(C @ W, inverse_of_m, rtol=0, atol=2e-15)
+
+
+def test_body_rates_are_those_of_the_turning_matrix():
+    angles = random_angles(60)
+    W = np.asarray(jax.jit(jax.vmap(lie.body_rate_from_euler_rate))(*angles.T))
+    for a, w in zip(angles, W, strict=True):
+        C = rotations.dcm(*a)
+        for k, axis in enumerate(np.eye(3)):
+            dC = central_difference(lambda b: rotations.dcm(*b), a, axis, 1e-3)
+            numeric = C.T @ dC
+            np.testing.assert_allclose(rotations.skew(w[:, k]), numeric, rtol=0, atol=1e-11)
+
+
+def test_body_rate_map_is_singular_at_a_quarter_turn_of_yaw_alone():
+    rng = np.random.default_rng(4)
+    pitch, roll = rng.uniform(-np.pi, np.pi, (2, 41))
+    pitch[:2], yaw = np.pi / 2, np.linspace(-np.pi / 2, np.pi / 2, 41)
+    W = np.asarray(jax.jit(jax.vmap(lie.body_rate_from_euler_rate))(pitch, yaw, roll))
+    np.testing.assert_allclose(np.linalg.det(W), -np.cos(yaw), rtol=0, atol=1e-15)
+
+
+def test_log_takes_every_branch_with_finite_derivatives():
+    # The largest component of the quaternion in turn, exact half turns and ties between components.
+    axes = np.concatenate([np.eye(3), [[1, 1, 0], [1, -1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]]])
+    axes = axes / np.linalg.norm(axes, axis=1)[:, None]
+    half = 2 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
+    near = np.array([rotations.exp((np.pi - 1e-7) * a) for a in axes])
+    third = np.array([rotations.exp(2 * np.pi / 3 * axes[-1])])
+    C = np.concatenate([np.eye(3)[None], half, near, third])
+    back, forward, reverse = jax.jit(
+        jax.vmap(lambda C: (lie.so3_log(C), jax.jacfwd(lie.so3_log)(C), jax.jacrev(lie.so3_log)(C)))
+    )(C)
+    np.testing.assert_allclose([rotations.exp(p) for p in np.asarray(back)], C, rtol=0, atol=2e-15)
+    np.testing.assert_allclose(back[9:17], (np.pi - 1e-7) * axes, rtol=0, atol=2e-15)
+    assert np.all(np.isfinite(forward))
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-14)
+
+
 def test_float32_stays_float32_and_precise():
     phi = vectors([1e-6, 1e-3, 0.1, 0.2 - 1e-6, 0.2 + 1e-6, 1.0, 3.0]).astype(np.float32)
     C, J, back = exp(phi), jax.jit(jax.vmap(lie.so3_left_jacobian))(phi), log(exp(phi))

@@ -6,13 +6,8 @@ import jax
 import numpy as np
 from oracles import rotations, sins
 
-from jaxnav.navigation.trajectory.rocket import (
-    RocketProfile,
-    attitude,
-    axial_force,
-    fly,
-    smooth_step,
-)
+from jaxnav.navigation.trajectory.base import smooth_step
+from jaxnav.navigation.trajectory.rocket import RocketProfile, attitude, axial_force, fly
 from jaxnav.units import DEG
 
 RADIUS = 6.371e6

@@ -6,12 +6,21 @@ Knows nothing of navigation: a state-space model from any field is a :class:`~.t
 
 def catalogue() -> dict[str, dict[str, str]]:
     """Return the filters, banks and weight rules with the first line of their documentation."""
-    from jaxnav.estimation.banks import mixture, weights
-    from jaxnav.estimation.filters import kalman, square_root
+    from jaxnav.estimation.banks import imm, mixture, weights
+    from jaxnav.estimation.filters import kalman, sigma_point, square_root
 
     groups = {
-        "filters": (kalman.kf, square_root.square_root_kf),
-        "banks": (mixture.bank, mixture.mmae, mixture.immae, mixture.panel),
+        "filters": (
+            kalman.kf,
+            kalman.ekf,
+            sigma_point.ukf,
+            sigma_point.ckf,
+            square_root.square_root_kf,
+            square_root.square_root_ekf,
+            sigma_point.square_root_ukf,
+            sigma_point.square_root_ckf,
+        ),
+        "banks": (mixture.bank, mixture.mmae, mixture.immae, imm.imm, mixture.panel),
         "weight rules": tuple(weights.RULES.values()),
     }
     return {

@@ -26,4 +26,4 @@ def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filte
     def update(params: Params, state: Any, u: Input, obs: Obs) -> tuple[Any, Any]:
         return filter.update(informed(params, u), state, u, obs)
 
-    return Filter(filter.init, predict, update, filter.estimate)
+    return filter._replace(predict=predict, update=update)

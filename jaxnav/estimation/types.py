@@ -18,6 +18,7 @@ Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 Scalar = Float[Array, ""]
 Mask = Bool[Array, " m"]
+LinearMap = Array | Callable[[Array], Array]
 Params = Any
 Point = Any
 Input = Any
@@ -32,12 +33,15 @@ class Flag(IntFlag):
             skipped.
         ILL_CONDITIONED: The factorisation kept fewer than about three digits; the update was made.
         ALL_MODELS_VETOED: No member of a bank had a finite likelihood: the weights were kept.
+        INDEFINITE: A covariance lost its positive definiteness in drawing sigma points or in a
+            downdate: the nearest factor at hand was used.
     """
 
     NO_OBSERVATION = 1
     NOT_POSITIVE_DEFINITE = 2
     ILL_CONDITIONED = 4
     ALL_MODELS_VETOED = 8
+    INDEFINITE = 16
 
 
 class Gaussian(NamedTuple):
@@ -82,11 +86,13 @@ def _difference(z: Array, z_pred: Array) -> Array:
     return z - z_pred
 
 
-def _add(x: Array, dx: Array) -> Array:
+def add(x: Array, dx: Array) -> Array:
+    """Return ``x + dx``: the ``retract`` of a vector space."""
     return x + dx
 
 
-def _subtract(x: Array, y: Array) -> Array:
+def subtract(x: Array, y: Array) -> Array:
+    """Return ``y - x``: the ``local`` of a vector space."""
     return y - x
 
 
@@ -102,10 +108,13 @@ class Model(NamedTuple):
         process_noise: ``(params, x, u) -> (n, n)`` discrete covariance in tangent coordinates.
         observe: ``(params, x, u) -> (m,)`` the stacked channels of all sensors.
         observation_noise: ``(params, x, u) -> (m, m)`` or ``(m,)``, a covariance or its diagonal.
-        residual: ``(z, z_pred) -> (m,)``; the default subtracts.
+        residual: ``(z, z_pred) -> (m,)``; the default subtracts. One that wraps angles or takes the
+            logarithm of a rotation makes the observation live on a manifold too.
         retract: ``(x, dx) -> x``; the default adds.
         local: ``(x, y) -> dx`` with ``retract(x, dx) == y``; the default subtracts.
-        jacobians: ``(params, x, u) -> (Phi, H)``, or ``None`` for automatic differentiation.
+        jacobians: ``(params, x, u) -> (Phi, H)`` in tangent coordinates, each a matrix or, for
+            structure that a matrix would hide, the linear function it stands for; ``None`` for
+            automatic differentiation.
     """
 
     transition: Callable[[Params, Point, Input], Point]
@@ -113,9 +122,9 @@ class Model(NamedTuple):
     observe: Callable[[Params, Point, Input], Array]
     observation_noise: Callable[[Params, Point, Input], Array]
     residual: Callable[[Array, Array], Array] = _difference
-    retract: Callable[[Point, Array], Point] = _add
-    local: Callable[[Point, Point], Array] = _subtract
-    jacobians: Callable[[Params, Point, Input], tuple[Array, Array]] | None = None
+    retract: Callable[[Point, Array], Point] = add
+    local: Callable[[Point, Point], Array] = subtract
+    jacobians: Callable[[Params, Point, Input], tuple[LinearMap, LinearMap]] | None = None
 
 
 class FilterParams(NamedTuple):
@@ -124,26 +133,36 @@ class FilterParams(NamedTuple):
     Attributes:
         model: The parameters of the :class:`Model`'s functions.
         initial: Mean and covariance at t0.
+        sigma: :class:`~jaxnav.numerics.sigma.SigmaRule` of a sigma-point filter; ``()`` is the rule
+            that the filter was built with.
     """
 
     model: Params
     initial: Gaussian
+    sigma: Any = ()
 
 
 class Filter(NamedTuple):
-    """A recursive estimator as four pure functions; a bank of filters is one too.
+    """A recursive estimator as pure functions; a bank of filters is one too.
 
     Attributes:
         init: ``(params) -> state`` at t0.
         predict: ``(params, state, u) -> state`` over one step.
         update: ``(params, state, u, obs) -> (state, info)`` with the same step's input.
         estimate: ``(state) -> Gaussian``.
+        restart: ``(state, Gaussian) -> state`` with another estimate and all else as it was, which
+            is how the members of an interacting bank exchange what they know.
+        retract: That of the estimate's manifold, as in :class:`Model`.
+        local: That of the estimate's manifold, as in :class:`Model`.
     """
 
     init: Callable[[Params], Any]
     predict: Callable[[Params, Any, Input], Any]
     update: Callable[[Params, Any, Input, Obs], tuple[Any, Any]]
     estimate: Callable[[Any], Any]
+    restart: Callable[[Any, Gaussian], Any]
+    retract: Callable[[Point, Array], Point] = add
+    local: Callable[[Point, Point], Array] = subtract
 
 
 class WeightPredict(Protocol):

@@ -4,8 +4,11 @@ Small angles take a Taylor branch, and the argument of the closed form is replac
 division and the root, so that both branches are finite and so are their gradients.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import Array
+
+from jaxnav.numerics.linalg import matmul
 
 
 def _taylor_angle(dtype: jnp.dtype) -> float:
@@ -21,6 +24,25 @@ def skew(v: Array) -> Array:
             jnp.stack([zero, -v[2], v[1]]),
             jnp.stack([v[2], zero, -v[0]]),
             jnp.stack([-v[1], v[0], zero]),
+        ]
+    )
+
+
+def _vee(K: Array) -> Array:
+    """Return the vector ``(3,)`` of a skew-symmetric matrix; inverse of :func:`skew`."""
+    return jnp.stack([K[2, 1], K[0, 2], K[1, 0]])
+
+
+def _skew_squared(v: Array) -> Array:
+    """Return ``[v]x^2 = v v' - |v|^2 I`` ``(3, 3)``, each diagonal entry as minus two squares."""
+    # A batched dot of 3x3 blocks costs more than all the rest of an exponential.
+    x, y, z = v[0], v[1], v[2]
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    return jnp.stack(
+        [
+            jnp.stack([-(yy + zz), xy, xz]),
+            jnp.stack([xy, -(xx + zz), yz]),
+            jnp.stack([xz, yz, -(xx + yy)]),
         ]
     )
 
@@ -45,8 +67,7 @@ def so3_exp(phi: Array) -> Array:
     ``exp([phi]x) = I + sin(a)/a [phi]x + (1 - cos(a))/a^2 [phi]x^2``, ``a = |phi|`` (Rodrigues).
     """
     sinc, half, _ = _exp_coefficients(jnp.sum(phi * phi))
-    K = skew(phi)
-    return jnp.eye(3, dtype=phi.dtype) + sinc * K + half * (K @ K)
+    return jnp.eye(3, dtype=phi.dtype) + sinc * skew(phi) + half * _skew_squared(phi)
 
 
 def so3_left_jacobian(phi: Array) -> Array:
@@ -56,8 +77,7 @@ def so3_left_jacobian(phi: Array) -> Array:
     ``so3_left_jacobian(-phi)``.
     """
     _, half, cubic = _exp_coefficients(jnp.sum(phi * phi))
-    K = skew(phi)
-    return jnp.eye(3, dtype=phi.dtype) + half * K + cubic * (K @ K)
+    return jnp.eye(3, dtype=phi.dtype) + half * skew(phi) + cubic * _skew_squared(phi)
 
 
 def so3_log(C: Array) -> Array:
@@ -67,34 +87,36 @@ def so3_log(C: Array) -> Array:
     keeps full precision up to and at the angle pi, where the direction is unique up to sign.
     """
     q = _largest_component_quaternion(C)
-    q = jnp.where(q[0] < 0, -q, q)
-    w, v = q[0], q[1:]
-    squared = jnp.sum(v * v)
+    negative = q[0] < 0
+    w, v = jnp.where(negative, -q[0], q[0]), q[1:]
+    squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     small = squared < 1e-4
-    safe = jnp.where(small, 1, squared)
-    norm = jnp.sqrt(safe)
+    norm = jnp.sqrt(jnp.where(small, 1, squared))
     # 2 atan(t)/t with t^2 = s/w^2, expanded where |v| is small; w is then near one.
-    t2 = squared / jnp.where(small, w, 1) ** 2
-    series = 2 / jnp.where(small, w, 1) * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9))))
-    return v * jnp.where(small, series, 2 * jnp.arctan2(norm, w) / norm)
+    safe = jnp.where(small, w, 1)
+    t2 = squared / safe**2
+    series = 2 / safe * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9))))
+    factor = jnp.where(small, series, 2 * jnp.arctan2(norm, w) / norm)
+    return v * jnp.where(negative, -factor, factor)
 
 
 def _largest_component_quaternion(C: Array) -> Array:
     """Return the unit quaternion ``(4,)``, scalar first, of a rotation matrix."""
     xx, yy, zz = C[0, 0], C[1, 1], C[2, 2]
-    squares = jnp.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
+    ww, xx, yy, zz = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
     wx, wy, wz = C[2, 1] - C[1, 2], C[0, 2] - C[2, 0], C[1, 0] - C[0, 1]
     xy, xz, yz = C[0, 1] + C[1, 0], C[0, 2] + C[2, 0], C[1, 2] + C[2, 1]
-    rows = jnp.stack(
-        [
-            jnp.stack([squares[0], wx, wy, wz]),
-            jnp.stack([wx, squares[1], xy, xz]),
-            jnp.stack([wy, xy, squares[2], yz]),
-            jnp.stack([wz, xz, yz, squares[3]]),
-        ]
-    )
-    largest = jnp.argmax(squares)
-    return rows[largest] / (2 * jnp.sqrt(squares[largest]))
+    # Four times the products of the components; the row of the largest square, by selections,
+    # since a gather does not vectorise. Of equal squares the first is taken.
+    upper, lower = ww >= xx, yy >= zz
+    first = jnp.where(upper, ww, xx) >= jnp.where(lower, yy, zz)
+
+    def select(w: Array, x: Array, y: Array, z: Array) -> Array:
+        return jnp.where(first, jnp.where(upper, w, x), jnp.where(lower, y, z))
+
+    row = [select(ww, wx, wy, wz), select(wx, xx, xy, xz), select(wy, xy, yy, yz)]
+    row = jnp.stack([*row, select(wz, xz, yz, zz)])
+    return row / (2 * jnp.sqrt(select(ww, xx, yy, zz)))
 
 
 def dcm_from_euler(pitch: Array, yaw: Array, roll: Array) -> Array:
@@ -133,22 +155,33 @@ def euler_error_from_rotation(C: Array) -> Array:
     """Return ``M`` ``(3, 3)`` taking a small rotation of ``C_ib`` to Euler-angle errors.
 
     For ``C_computed = (I + [phi]x) C``, the errors (pitch, yaw, roll), computed minus true, are
-    ``M phi`` to first order, with
+    ``M phi`` to first order: the derivative of the angles of ``exp([phi]x) C`` at zero, with
 
         inv(M) = [0, -sin(pitch), cos(pitch) cos(yaw);
                   0,  cos(pitch), sin(pitch) cos(yaw);
                   1,  0,          -sin(yaw)]
 
-    This is what Eq. (38) of Zhao et al. (2018) means; as printed it is singular at a pitch of pi/4
-    and of pi/2, the attitude at lift-off.
+    and so singular at a yaw of +-pi/2 alone. This is what Eq. (38) of Zhao et al. (2018) means; as
+    printed it is singular at a pitch of pi/4 and of pi/2, the attitude at lift-off.
     """
-    pitch, yaw, _ = euler_from_dcm(C)
-    cp, sp, cy, ty = jnp.cos(pitch), jnp.sin(pitch), jnp.cos(yaw), jnp.tan(yaw)
-    zero, one = jnp.zeros((), C.dtype), jnp.ones((), C.dtype)
-    return jnp.stack(
-        [
-            jnp.stack([cp * ty, sp * ty, one]),
-            jnp.stack([-sp, cp, zero]),
-            jnp.stack([cp / cy, sp / cy, zero]),
-        ]
-    )
+    return jax.jacfwd(lambda phi: euler_from_dcm(matmul(so3_exp(phi), C)))(jnp.zeros(3, C.dtype))
+
+
+def body_rate_from_euler_rate(pitch: Array, yaw: Array, roll: Array) -> Array:
+    """Return ``W`` ``(3, 3)`` taking Euler-angle rates to the angular rate in body axes.
+
+    ``omega_ib = W (pitch', yaw', roll')`` is the vector of ``C' dC/dt`` for the matrix ``C_ib`` of
+    :func:`dcm_from_euler` at angles in rad, whose derivative is automatic:
+
+        W = [-sin(yaw),            0,         1;
+             sin(roll) cos(yaw),   cos(roll), 0;
+             cos(roll) cos(yaw),  -sin(roll), 0]
+
+    References:
+        Zhao, Chen, He, Ge (2018), Eq. (35), whose element (3, 1) is printed ``cos(roll) sin(yaw)``:
+        a vehicle with no yaw and no roll would then pitch without turning.
+    """
+    angles = jnp.stack([pitch, yaw, roll])
+    C = dcm_from_euler(pitch, yaw, roll)
+    slopes = jax.jacfwd(lambda a: dcm_from_euler(a[0], a[1], a[2]))(angles)
+    return jnp.stack([_vee(matmul(C.T, slopes[:, :, k])) for k in range(3)], axis=1)

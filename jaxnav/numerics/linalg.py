@@ -140,24 +140,73 @@ def tria(A: Array) -> Array:
     return (R * signs[:, None]).T
 
 
-def semidefinite_root(A: Array) -> Array:
-    """Return a lower ``L`` ``(n, n)`` with ``L L' = A`` for a positive semi-definite ``A``.
+class SemidefiniteRoot(NamedTuple):
+    """Lower factor ``L L' = A`` of a positive semi-definite matrix, with its health.
+
+    Attributes:
+        factor: ``(n, n)`` lower; columns without a positive pivot are zero.
+        semidefinite: Whether no pivot was negative by more than rounding.
+    """
+
+    factor: Array
+    semidefinite: Array
+
+
+def semidefinite_root(A: Array) -> SemidefiniteRoot:
+    """Factor a positive semi-definite matrix ``(n, n)``; one that is not is reported.
 
     Columns whose pivot is not positive are zero, so covariances with states that carry no noise are
     factored; the gradient with respect to such a zero pivot is zero. The diagonal is raised by
     ``2 n`` rounding errors first: without that, a matrix that is singular to rounding loses its
     digits in the elimination (2e-3 relative at n = 15). A variance that is negative or not a number
-    makes the result NaN.
+    makes the factor NaN.
     """
     n = A.shape[0]
-    sound = jnp.all(jnp.diag(A) >= 0)
-    A = A + 2 * n * jnp.finfo(A.dtype).eps * jnp.diag(jnp.diag(A))
-    rows = jnp.arange(n)
+    diagonal = jnp.diag(A)
+    sound = jnp.all(diagonal >= 0)
+    rounding = 2 * n * jnp.finfo(A.dtype).eps
+    A = A + rounding * jnp.diag(diagonal)
+    lowest = jnp.zeros((), A.dtype)
     columns: list[Array] = []
     for j in range(n):
-        good = A[j, j] > 0
-        root = jnp.sqrt(jnp.where(good, A[j, j], 1))
-        column = jnp.where(good & (rows >= j), A[:, j] / root, 0)
-        A = A - column[:, None] * column[None, :]
-        columns.append(column)
-    return jnp.where(sound, jnp.stack(columns, axis=1), jnp.nan)
+        pivot = A[0, 0]
+        good = pivot > 0
+        column = A[:, 0] * jnp.where(good, 1 / jnp.sqrt(jnp.where(good, pivot, 1)), 0)
+        A = A[1:, 1:] - column[1:, None] * column[None, 1:]
+        columns.append(jnp.concatenate([jnp.zeros(j, A.dtype), column]))
+        scale = jnp.where(diagonal[j] > 0, diagonal[j], 1)
+        lowest = jnp.minimum(lowest, pivot / scale)
+    factor = jnp.where(sound, jnp.stack(columns, axis=1), jnp.nan)
+    return SemidefiniteRoot(factor, sound & (lowest >= -8 * rounding))
+
+
+def downdate(L: Array, v: Array) -> SemidefiniteRoot:
+    """Return the lower factor of ``L L' - v v'``, by hyperbolic rotations in mixed form.
+
+    Where the difference is not positive definite, ``L`` is returned as it is and reported.
+
+    Args:
+        L: Lower factor ``(n, n)`` with a non-negative diagonal.
+        v: ``(n,)``.
+
+    References:
+        Bojanczyk, Brent, van Dooren, de Hoog (1987), SIAM J. Sci. Stat. Comput. 8(3).
+    """
+    n = L.shape[0]
+    rest, tail = L, v
+    sound = jnp.array(True)
+    columns: list[Array] = []
+    for j in range(n):
+        pivot, lead = rest[0, 0], tail[0]
+        squared = (pivot - lead) * (pivot + lead)
+        good = (squared > 0) & (pivot > 0)
+        sound = sound & (good | ((pivot == 0) & (lead == 0)))
+        root = jnp.sqrt(jnp.where(good, squared, 1))
+        safe = jnp.where(good, pivot, 1)
+        cosine, sine = root / safe, jnp.where(good, lead / safe, 0)
+        column = (rest[1:, 0] - sine * tail[1:]) / cosine
+        tail = cosine * tail[1:] - sine * column
+        head = jnp.where(good, root, 0)[None]
+        columns.append(jnp.concatenate([jnp.zeros(j, L.dtype), head, column]))
+        rest = rest[1:, 1:]
+    return SemidefiniteRoot(jnp.where(sound, jnp.stack(columns, axis=1), L), sound)

@@ -4,7 +4,7 @@ The members never interact, so several weight rules can watch one set of members
 compares rules at the price of one bank.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +19,17 @@ from jaxnav.estimation.banks.weights import (
     normalise,
     windowed_reset,
 )
-from jaxnav.estimation.types import Filter, Flag, Gaussian, Info, Input, Obs, WeightRule
+from jaxnav.estimation.types import (
+    Filter,
+    Flag,
+    Gaussian,
+    Info,
+    Input,
+    Obs,
+    WeightRule,
+    add,
+    subtract,
+)
 from jaxnav.numerics.linalg import cholesky, solve_lower, symmetrise
 
 
@@ -104,9 +114,16 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
 
     def estimate(state: PanelState) -> dict[str, Gaussian]:
         members = estimate_members(state.members)
-        return {name: moment_match(state.log_weights[name], members) for name in names}
+        return {
+            name: moment_match(state.log_weights[name], members, filter.retract, filter.local)
+            for name in names
+        }
 
-    return Filter(init, predict, update, estimate)
+    def restart(state: PanelState, given: Gaussian) -> PanelState:
+        members = jax.vmap(filter.restart, in_axes=(0, None))(state.members, given)
+        return state._replace(members=members)
+
+    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local)
 
 
 def bank(filter: Filter, rule: WeightRule) -> Filter:
@@ -146,7 +163,10 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
     def estimate(state: BankState) -> Gaussian:
         return single.estimate(wide_state(state))[""]
 
-    return Filter(init, predict, update, estimate)
+    def restart(state: BankState, given: Gaussian) -> BankState:
+        return narrow(single.restart(wide_state(state), given))
+
+    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local)
 
 
 def mmae(filter: Filter) -> Filter:
@@ -177,15 +197,41 @@ def _log_prior(log_prior: Any, name: str, count: int, dtype: Any) -> Array:
     return normalise(jnp.asarray(given, dtype))
 
 
-def moment_match(log_weights: Array, members: Gaussian) -> Gaussian:
+def moment_match(
+    log_weights: Array,
+    members: Gaussian,
+    retract: Callable[[Any, Array], Any] = add,
+    local: Callable[[Any, Any], Array] = subtract,
+) -> Gaussian:
     """Return the Gaussian with the mean and covariance of a mixture.
 
         x = sum w_i x_i,   P = sum w_i (P_i + (x_i - x)(x_i - x)')
 
+    On a manifold the sums are taken in the tangent space at the likeliest member, into which the
+    covariances are taken as they are: right to first order in the spread of the means.
+
     Args:
         log_weights: ``(M,)`` normalised; members at ``-inf`` have no effect, even if not finite.
-        members: Means ``(M, n)`` and covariances ``(M, n, n)``.
+        members: Means with a leading axis ``M`` and covariances ``(M, n, n)``.
+        retract: That of the mean's manifold; the default is a vector space.
+        local: Likewise.
     """
+    if retract is add and local is subtract:
+        return _moment_match(log_weights, members)
+    reference = likeliest(log_weights, members.mean)
+    offsets = jax.vmap(local, in_axes=(None, 0))(reference, members.mean)
+    mixed = _moment_match(log_weights, Gaussian(offsets, members.cov))
+    return Gaussian(retract(reference, mixed.mean), mixed.cov)
+
+
+def likeliest(log_weights: Array, means: Any) -> Any:
+    """Return the mean, out of those with a leading axis ``M``, of the largest weight."""
+    best = jnp.argmax(log_weights)
+    return jax.tree.map(lambda leaf: leaf[best], means)
+
+
+def _moment_match(log_weights: Array, members: Gaussian) -> Gaussian:
+    """Match moments in a vector space: means ``(M, n)``."""
     used = active(log_weights)
     w = jnp.where(used, jnp.exp(log_weights), 0)
     means = jnp.where(used[:, None], members.mean, 0)

@@ -152,6 +152,56 @@ def markov() -> WeightRule:
     return WeightRule(_stateless, predict, _ignore_data)
 
 
+class Switched(NamedTuple):
+    """A step of the chain over model indices, in log-probabilities.
+
+    Attributes:
+        log_weights: ``(M,)`` of the models after the step.
+        origins: ``(M, M)``; ``origins[i, j]`` is that of having been in model ``i``, given ``j`` now;
+            a model that cannot be reached comes from itself.
+    """
+
+    log_weights: Array
+    origins: Array
+
+
+def switched(log_weights: Array, transition: Array) -> Switched:
+    """Move log-weights ``(M,)`` over a step of a Markov chain.
+
+    Args:
+        log_weights: Before the step; members at ``-inf`` stay there, and what would go to them is
+            shared out.
+        transition: ``(M, M)``; ``transition[i, j]`` is the probability to go from ``i`` to ``j``.
+    """
+    members = active(log_weights)
+    possible = (transition > 0) & members[:, None] & members[None, :]
+    log_transition = jnp.log(jnp.where(possible, transition, 1))
+    start = jnp.where(members, log_weights, 0)[:, None]
+    joint = jnp.where(possible, start + log_transition, -jnp.inf)
+    reached = jnp.any(possible, axis=0)
+    total = jax.nn.logsumexp(jnp.where(reached[None], joint, 0), axis=0)
+    itself = jnp.where(jnp.eye(members.shape[0], dtype=bool), 0.0, -jnp.inf).astype(joint.dtype)
+    origins = jnp.where(reached[None], joint - total[None], itself)
+    return Switched(normalise(jnp.where(reached, total, -jnp.inf)), origins)
+
+
+def switch() -> WeightRule:
+    """Return Markov switching with any transition matrix ``(M, M)``, which is the parameter.
+
+    Before the data, ``w_j = sum_i w_i Pi_ij``; rows of ``Pi`` sum to one. :func:`markov` is the
+    case of equal probabilities to go elsewhere.
+
+    References:
+        Blom and Bar-Shalom (1988), IEEE Trans. Automatic Control 33(8).
+    """
+
+    def predict(params: Array, state: Any, log_weights: Array, k: Array) -> Array:
+        del state, k
+        return switched(log_weights, params).log_weights
+
+    return WeightRule(_stateless, predict, _ignore_data)
+
+
 class WindowedReset(NamedTuple):
     """Parameters of :func:`windowed_reset`.
 
@@ -245,6 +295,7 @@ def chain(*rules: WeightRule) -> WeightRule:
 
 
 RULES: dict[str, Callable[..., WeightRule]] = {
-    rule.__name__: rule for rule in (fixed, bayes, floor, forget, markov, windowed_reset, chain)
+    rule.__name__: rule
+    for rule in (fixed, bayes, floor, forget, markov, switch, windowed_reset, chain)
 }
 """The rules by name, for listing."""

@@ -5,21 +5,51 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.kalman import (
+from jaxnav.estimation.filters.innovation import (
     innovation_info,
     mask_noise,
     masked_innovation,
-    require_vector_space,
-    tangent_map,
+    require_prior,
+    require_step,
 )
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
+from jaxnav.estimation.filters.linearise import (
+    observation_map,
+    require_vector_space,
+    transition_map,
+)
+from jaxnav.estimation.types import (
+    Filter,
+    FilterParams,
+    Gaussian,
+    Info,
+    Input,
+    Model,
+    Obs,
+    Point,
+)
 from jaxnav.numerics.linalg import Cholesky, semidefinite_root, solve_lower, tria
 
 
 class SquareRootState(NamedTuple):
-    """Mean ``(n,)`` and a lower factor ``L`` ``(n, n)`` of the covariance ``P = L L'``."""
+    """Mean and a lower factor ``L`` ``(n, n)`` of the covariance ``P = L L'``."""
 
-    x: Array
+    x: Point
+    L: Array
+
+
+class ArrayUpdate(NamedTuple):
+    """What the triangular array of an update holds.
+
+    Attributes:
+        S: ``(m, m)`` innovation covariance.
+        root: Its lower factor with its health.
+        gain: ``(n, m)`` the gain times that factor; zero if the factor is not usable.
+        L: ``(n, n)`` factor of the updated covariance; the predicted one if it is not.
+    """
+
+    S: Array
+    root: Cholesky
+    gain: Array
     L: Array
 
 
@@ -44,37 +74,72 @@ def square_root_kf(model: Model) -> Filter:
         Kailath, Sayed, Hassibi (2000), Linear Estimation, section 12.3.
     """
     require_vector_space(model)
+    return square_root_ekf(model)
+
+
+def square_root_ekf(model: Model) -> Filter:
+    """Return the extended Kalman filter in the form of :func:`square_root_kf`.
+
+    The maps ``Phi`` and ``H`` are those of :func:`~jaxnav.estimation.filters.kalman.ekf`. Range,
+    rank of the gradients and the caution about several devices are as for the linear filter.
+    """
 
     def init(params: FilterParams) -> SquareRootState:
-        return SquareRootState(params.initial.mean, semidefinite_root(params.initial.cov))
+        require_prior(model, params.initial)
+        return SquareRootState(params.initial.mean, semidefinite_root(params.initial.cov).factor)
 
     def predict(params: FilterParams, state: SquareRootState, u: Input) -> SquareRootState:
-        x, push = tangent_map(lambda x: model.transition(params.model, x, u), state.x)
-        noise = semidefinite_root(model.process_noise(params.model, state.x, u))
+        x, push = transition_map(model, params.model, state.x, u, state.L.shape[0])
+        Q = model.process_noise(params.model, state.x, u)
+        require_step(model, state.x, x, Q)
+        noise = semidefinite_root(Q).factor
         return SquareRootState(x, tria(jnp.concatenate([push(state.L), noise], axis=1)))
 
     def update(
         params: FilterParams, state: SquareRootState, u: Input, obs: Obs
     ) -> tuple[SquareRootState, Info]:
-        z_pred, push = tangent_map(lambda x: model.observe(params.model, x, u), state.x)
+        z_pred, push = observation_map(model, params.model, state.x, u, state.L.shape[0])
         nu = masked_innovation(model, obs, z_pred)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         HL = jnp.where(obs.valid[:, None], push(state.L), 0)
-        m, n = HL.shape
-        array = tria(
-            jnp.block([[semidefinite_root(R), HL], [jnp.zeros((n, m), HL.dtype), state.L]])
-        )
-        root = _checked(array[:m, :m])
-        gain = jnp.where(root.positive_definite, array[m:, :m], 0)
-        L = jnp.where(root.positive_definite, array[m:, m:], state.L)
-        x = state.x + gain @ solve_lower(root.factor, nu)
-        S = root.factor @ root.factor.T
-        return SquareRootState(x, L), innovation_info(nu, S, root, obs.valid)
+        done = read_array(tria(update_array(R, HL, state.L)), HL.shape[0], state.L)
+        x = model.retract(state.x, done.gain @ solve_lower(done.root.factor, nu))
+        return SquareRootState(x, done.L), innovation_info(nu, done.S, done.root, obs.valid)
 
     def estimate(state: SquareRootState) -> Gaussian:
         return Gaussian(state.x, state.L @ state.L.T)
 
-    return Filter(init, predict, update, estimate)
+    def restart(state: SquareRootState, given: Gaussian) -> SquareRootState:
+        del state
+        return SquareRootState(given.mean, semidefinite_root(given.cov).factor)
+
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+
+
+def update_array(R: Array, seen: Array, spread: Array) -> Array:
+    """Return ``[sqrt(R), seen; 0, spread]`` ``(m + n, m + k)``, whose triangle is the update.
+
+    Args:
+        R: ``(m, m)`` noise covariance.
+        seen: ``(m, k)`` columns of a root of the predicted observation's covariance.
+        spread: ``(n, k)`` the same columns of a root of the predicted state's covariance.
+    """
+    zero = jnp.zeros((spread.shape[0], R.shape[0]), spread.dtype)
+    return jnp.block([[semidefinite_root(R).factor, seen], [zero, spread]])
+
+
+def read_array(triangle: Array, m: int, predicted: Array) -> ArrayUpdate:
+    """Take the triangle ``(m + n, m + n)`` of :func:`update_array` apart.
+
+    Args:
+        triangle: Lower, with a non-negative diagonal.
+        m: Number of channels.
+        predicted: ``(n, n)`` factor to keep if the update has to be skipped.
+    """
+    root = _checked(triangle[:m, :m])
+    gain = jnp.where(root.positive_definite, triangle[m:, :m], 0)
+    L = jnp.where(root.positive_definite, triangle[m:, m:], predicted)
+    return ArrayUpdate(root.factor @ root.factor.T, root, gain, L)
 
 
 def _checked(root: Array) -> Cholesky:

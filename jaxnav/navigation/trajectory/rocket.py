@@ -9,6 +9,7 @@ from jax import Array
 
 from jaxnav.navigation.earth import gravity_launch_inertial
 from jaxnav.navigation.strapdown import NavState
+from jaxnav.navigation.trajectory.base import Trajectory, simpson, smooth_step
 from jaxnav.numerics.lie import dcm_from_euler, so3_log
 from jaxnav.numerics.ode import rk4
 from jaxnav.units import DEG
@@ -45,28 +46,6 @@ class RocketProfile(NamedTuple):
     roll_rate: float = 2.0 * DEG
     sway: float = 2.0 * DEG
     sway_period: float = 60.0
-
-
-class Trajectory(NamedTuple):
-    """True motion at ``N + 1`` equally spaced times, and perfect increments between them.
-
-    Attributes:
-        time: ``(N + 1,) [s]``.
-        state: :class:`~jaxnav.navigation.strapdown.NavState`, leading axis ``N + 1``.
-        dtheta: ``(N, 3) [rad]`` rotation vectors of the body over each interval.
-        dvel: ``(N, 3) [m/s]`` integrals of the specific force in body axes.
-    """
-
-    time: Array
-    state: NavState
-    dtheta: Array
-    dvel: Array
-
-
-def smooth_step(s: Array) -> Array:
-    """Return the C2 step ``s^3 (10 - 15 s + 6 s^2)``, 0 below 0 and 1 above 1."""
-    s = jnp.clip(s, 0, 1)
-    return s**3 * (10 - 15 * s + 6 * s * s)
 
 
 def attitude(profile: RocketProfile, time: Array) -> Array:
@@ -130,5 +109,5 @@ def _axial_increments(profile: RocketProfile, time: Array, step: float) -> Array
     force = partial(axial_force, profile)
     start, end = force(time[:-1]), force(time[1:])
     middle = force(time[:-1] + 0.5 * step)
-    axial = step * (start + 4 * middle + end) / 6
+    axial = simpson(start, middle, end, step)
     return axial[:, None] * jnp.array([[1.0, 0.0, 0.0]], time.dtype)

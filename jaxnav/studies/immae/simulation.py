@@ -24,7 +24,8 @@ from jaxnav.navigation.strapdown import (
     mechanise_launch_inertial,
     rotation_compensated,
 )
-from jaxnav.navigation.trajectory.rocket import RocketProfile, Trajectory, fly
+from jaxnav.navigation.trajectory.base import Trajectory
+from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
 from jaxnav.numerics.lie import euler_error_from_rotation, so3_exp
 from jaxnav.numerics.linalg import matmul
 from jaxnav.studies.immae.config import ImmaeConfig

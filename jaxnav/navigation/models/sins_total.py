@@ -1,0 +1,243 @@
+"""Total state of a strapdown inertial system aided by a star tracker, launch-inertial frame.
+
+The state is the navigation solution itself, driven by the increments of the inertial sensors:
+attitude C_ib, velocity, position, gyro drift eps and accelerometer error nabla (body axes, measured
+minus true), the last a first-order Markov process. Its tangent space has fifteen coordinates in the
+blocks of :data:`~jaxnav.navigation.models.sins_cns.LAYOUT`; the attitude's is the small rotation phi
+in inertial axes with ``C_computed = exp([phi]x) C_true``.
+
+References:
+    Zhao, Chen, He, Ge (2018), IEEE/CAA JAS 5(6), Eqs. (31)-(40). The paper never states its state
+    vector; this is the reading under which its nonlinear filters differ from linear ones.
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.types import Model
+from jaxnav.navigation.earth import gravity_gradient_launch_inertial, gravity_launch_inertial
+from jaxnav.navigation.models.sins_cns import LAYOUT
+from jaxnav.numerics.lie import (
+    euler_error_from_rotation,
+    euler_from_dcm,
+    so3_exp,
+    so3_left_jacobian,
+    so3_log,
+)
+from jaxnav.numerics.linalg import matmul
+
+StarForm = Literal["rotation-vector", "euler"]
+
+
+class SinsTotal(NamedTuple):
+    """A point of the state's manifold.
+
+    Attributes:
+        dcm: C_ib ``(3, 3)``.
+        velocity: ``(3,) [m/s]``.
+        position: ``(3,) [m]`` from the launch point.
+        drift: Gyro drift ``(3,) [rad/s]``.
+        bias: Accelerometer error ``(3,) [m/s^2]``.
+    """
+
+    dcm: Array
+    velocity: Array
+    position: Array
+    drift: Array
+    bias: Array
+
+
+class SinsTotalParams(NamedTuple):
+    """Noise of the model.
+
+    Attributes:
+        gyro_noise: ``(3,) [rad/s]`` standard deviation of one gyro sample, body axes.
+        accel_noise: ``(3,) [m/s^2]`` standard deviation of one accelerometer sample, body axes.
+        bias_sigma: Stationary standard deviation of the accelerometer error [m/s^2], each axis.
+        bias_time: Its correlation time [s].
+        star_noise: ``(3,) [rad]`` standard deviation of the star tracker, inertial axes.
+    """
+
+    gyro_noise: Array
+    accel_noise: Array
+    bias_sigma: Array
+    bias_time: Array
+    star_noise: Array
+
+
+class SinsTotalInput(NamedTuple):
+    """What the inertial sensors report over one filter period.
+
+    Attributes:
+        dtheta: ``(3,) [rad]`` rotation vector of the body over the period.
+        dvel: ``(3,) [m/s]`` integral of the specific force in the body axes of the period's start
+            (see :func:`~jaxnav.navigation.strapdown.accumulate`).
+        true_scale: True factor on the variances of the inertial noises, for an informed filter only.
+    """
+
+    dtheta: Array
+    dvel: Array
+    true_scale: Array
+
+
+def retract(x: SinsTotal, dx: Array) -> SinsTotal:
+    """Return the state displaced by a tangent vector ``(15,)``."""
+    s = LAYOUT
+    return SinsTotal(
+        dcm=matmul(so3_exp(dx[s.phi]), x.dcm),
+        velocity=x.velocity + dx[s.dv],
+        position=x.position + dx[s.dr],
+        drift=x.drift + dx[s.eps],
+        bias=x.bias + dx[s.nabla],
+    )
+
+
+def local(x: SinsTotal, y: SinsTotal) -> Array:
+    """Return the tangent vector ``(15,)`` from ``x`` to ``y``."""
+    return jnp.concatenate(
+        [
+            so3_log(matmul(y.dcm, x.dcm.T)),
+            y.velocity - x.velocity,
+            y.position - x.position,
+            y.drift - x.drift,
+            y.bias - x.bias,
+        ]
+    )
+
+
+def sins_total(
+    period: float, imu_step: float, radius: Array | float, star: StarForm = "rotation-vector"
+) -> Model:
+    """Return the 15-state model, driven by the increments of one filter period.
+
+        C+ = C exp([dtheta - T eps]x)
+        v+ = v + C (dvel - T nabla - T/2 eps x dvel) + g(r + v T/2) T
+        r+ = r + (v + v+) T/2
+        eps+ = eps,   nabla+ = exp(-T / tau) nabla
+
+    The process noise of attitude and velocity is ``Q0 T T_imu`` with ``Q0`` the variances per
+    sample, as for :func:`~jaxnav.navigation.models.sins_cns.sins_cns`.
+
+    Args:
+        period: Filter period ``T`` [s].
+        imu_step: Interval of the inertial samples ``T_imu`` [s].
+        radius: Distance from the Earth's centre to the launch point [m].
+        star: How the star tracker's attitude is observed: as the rotation vector of C_ib with the
+            residual ``log(C_z C_pred')``, which is linear in phi, or as pitch, yaw and roll with
+            the angles' differences wrapped to +-pi, as in the paper, which is not.
+
+    Returns:
+        A model with :class:`SinsTotalParams` and :class:`SinsTotalInput`, three channels and
+        analytic Jacobians.
+    """
+    observe, residual, noise, observed = _STAR[star]
+
+    def transition(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> SinsTotal:
+        felt = u.dvel - period * (x.bias + 0.5 * jnp.cross(x.drift, u.dvel))
+        pull = gravity_launch_inertial(x.position + 0.5 * period * x.velocity, radius)
+        velocity = x.velocity + matmul(x.dcm, felt) + period * pull
+        return SinsTotal(
+            dcm=matmul(x.dcm, so3_exp(u.dtheta - period * x.drift)),
+            velocity=velocity,
+            position=x.position + 0.5 * period * (x.velocity + velocity),
+            drift=x.drift,
+            bias=jnp.exp(-period / params.bias_time) * x.bias,
+        )
+
+    def process_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
+        del u
+        spread = period * imu_step
+        attitude = _rotated(x.dcm, spread * params.gyro_noise**2)
+        velocity = _rotated(x.dcm, spread * params.accel_noise**2)
+        driven = params.bias_sigma**2 * -jnp.expm1(-2 * period / params.bias_time)
+        bias = driven * jnp.eye(3, dtype=x.bias.dtype)
+        return (
+            jnp.pad(attitude, ((0, 12), (0, 12)))
+            + jnp.pad(velocity, ((3, 9), (3, 9)))
+            + jnp.pad(bias, ((12, 0), (12, 0)))
+        )
+
+    def jacobians(
+        params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput
+    ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+        s = LAYOUT
+        turn = u.dtheta - period * x.drift
+        felt = matmul(x.dcm, u.dvel - period * (x.bias + 0.5 * jnp.cross(x.drift, u.dvel)))
+        turning = matmul(x.dcm, so3_left_jacobian(turn))
+        pull = gravity_gradient_launch_inertial(x.position + 0.5 * period * x.velocity, radius)
+        fading = jnp.exp(-period / params.bias_time)
+
+        def moved(d: Array) -> Array:
+            sensed = d[s.nabla] + 0.5 * jnp.cross(d[s.eps], u.dvel)
+            gained = (
+                jnp.cross(d[s.phi], felt)
+                - period * matmul(x.dcm, sensed)
+                + period * matmul(pull, d[s.dr] + 0.5 * period * d[s.dv])
+            )
+            return jnp.concatenate(
+                [
+                    d[s.phi] - period * matmul(turning, d[s.eps]),
+                    d[s.dv] + gained,
+                    d[s.dr] + period * (d[s.dv] + 0.5 * gained),
+                    d[s.eps],
+                    fading * d[s.nabla],
+                ]
+            )
+
+        return moved, observed(x)
+
+    return Model(
+        transition, process_noise, observe, noise, residual, retract, local, jacobians
+    )
+
+
+def _rotated(C: Array, variances: Array) -> Array:
+    """Return ``C diag(variances) C'``."""
+    return matmul(C * variances[None], C.T)
+
+
+def _rotation_vector(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
+    del params, u
+    return so3_log(x.dcm)
+
+
+def _rotation_between(z: Array, z_pred: Array) -> Array:
+    return so3_log(matmul(so3_exp(z), so3_exp(z_pred).T))
+
+
+def _isotropic_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
+    del x, u
+    return params.star_noise**2
+
+
+def _attitude_part(x: SinsTotal) -> Callable[[Array], Array]:
+    del x
+    return lambda d: d[LAYOUT.phi]
+
+
+def _euler_angles(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
+    del params, u
+    return euler_from_dcm(x.dcm)
+
+
+def _wrapped(z: Array, z_pred: Array) -> Array:
+    return jnp.mod(z - z_pred + jnp.pi, 2 * jnp.pi) - jnp.pi
+
+
+def _euler_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
+    del u
+    return _rotated(euler_error_from_rotation(x.dcm), params.star_noise**2)
+
+
+def _euler_part(x: SinsTotal) -> Callable[[Array], Array]:
+    M = euler_error_from_rotation(x.dcm)
+    return lambda d: matmul(M, d[LAYOUT.phi])
+
+
+_STAR = {
+    "rotation-vector": (_rotation_vector, _rotation_between, _isotropic_noise, _attitude_part),
+    "euler": (_euler_angles, _wrapped, _euler_noise, _euler_part),
+}
