@@ -10,6 +10,7 @@ import pytest
 from jax import Array
 from jax.test_util import check_grads
 
+from jaxnav.estimation.banks.imm import imm, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, bank, immae, mmae
 from jaxnav.estimation.banks.weights import (
     WindowedReset,
@@ -20,8 +21,9 @@ from jaxnav.estimation.banks.weights import (
     markov,
 )
 from jaxnav.estimation.bounds import oracle
-from jaxnav.estimation.filters.kalman import kf
-from jaxnav.estimation.filters.square_root import square_root_kf
+from jaxnav.estimation.filters.kalman import ekf, kf
+from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
+from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
 from jaxnav.estimation.run import Trace, run
 from jaxnav.estimation.tune import negative_log_likelihood
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs, replicate
@@ -31,6 +33,7 @@ from tests.oracles.kalman import (
     bayes_weights,
     floor_weights,
     immae_weights,
+    interacting,
     kalman,
     markov_weights,
     mixture,
@@ -39,6 +42,7 @@ from tests.oracles.kalman import (
 STEPS, RUNS, STATES, CHANNELS = 12, 6, 4, 2
 THETA = (0.2, 1.0, 8.0)
 LOST = 3
+SWITCHING = uniform_switching(3, 0.05)
 
 
 class Noise(NamedTuple):
@@ -100,6 +104,12 @@ def _cases() -> dict[str, Case]:
         "kf": base,
         "square_root_kf": square_root_kf(dense_model()),
         "oracle": oracle(base, lambda params, u: params),
+        "ekf": ekf(dense_model()),
+        "square_root_ekf": square_root_ekf(dense_model()),
+        "ukf": ukf(dense_model()),
+        "ckf": ckf(dense_model()),
+        "square_root_ukf": square_root_ukf(dense_model()),
+        "square_root_ckf": square_root_ckf(dense_model()),
     }
     reset = WindowedReset(jnp.array(5.0), jnp.array(0.9), jnp.array(0.05))
     banks: dict[str, tuple[Filter, Any]] = {
@@ -110,6 +120,9 @@ def _cases() -> dict[str, Case]:
         "floor": (bank(base, chain(bayes(), floor())), ((), jnp.array(1e-3))),
         "forget": (bank(base, chain(forget(), bayes())), (jnp.array(0.95), ())),
         "markov": (bank(base, chain(markov(), bayes())), (jnp.array(0.05), ())),
+        "imm": (imm(base), SWITCHING),
+        "mmae of ukf": (mmae(singles["ukf"]), ()),
+        "immae of ckf": (immae(singles["ckf"]), ((), reset)),
     }
     cases = {name: Case(made, single(), single()) for name, made in singles.items()}
     for name, (made, rule) in banks.items():
@@ -168,9 +181,13 @@ def batch_run(name: str, params: Any, z: Array) -> Trace:
 
 
 def reference(theta: float, z: np.ndarray, valid: np.ndarray) -> History:
-    """The NumPy filter with offsets moved into the data."""
+    """The NumPy filter of the test's model."""
+    return without_offset(kalman(augmented(theta), shifted(z), valid))
+
+
+def augmented(theta: float) -> Linear:
+    """The test's model for NumPy: an offset is one more state that stays one."""
     steps = jax.tree.map(np.asarray, PROBLEM.inputs)
-    # an offset is one more state that stays one
     Phi = np.zeros((STEPS, STATES + 1, STATES + 1))
     Phi[:, :STATES, :STATES], Phi[:, :STATES, STATES], Phi[:, STATES, STATES] = (
         steps.Phi,
@@ -183,8 +200,16 @@ def reference(theta: float, z: np.ndarray, valid: np.ndarray) -> History:
     P0 = np.zeros((STATES + 1, STATES + 1))
     P0[:STATES, :STATES] = prior.cov
     H = np.hstack([OBSERVATION, np.zeros((CHANNELS, 1))])
-    model = Linear(Phi, Q, H, NOISE, np.append(prior.mean, 1.0), P0)
-    full = kalman(model, z - steps.offset[:, :CHANNELS], valid)
+    return Linear(Phi, Q, H, NOISE, np.append(prior.mean, 1.0), P0)
+
+
+def shifted(z: np.ndarray) -> np.ndarray:
+    """Observations with the offset of their equation taken off."""
+    return z - np.asarray(PROBLEM.inputs.offset)[:, :CHANNELS]
+
+
+def without_offset(full: History) -> History:
+    """The part of a history that the test's model has."""
     return History(full.mean[:, :STATES], full.cov[:, :STATES, :STATES], full.log_likelihood)
 
 
@@ -201,10 +226,26 @@ def test_members_alike_equal_the_kalman_filter(name: str) -> None:
         )
 
 
+def test_imm_equals_the_textbook_loop() -> None:
+    estimate, info = batch_run("imm", CASES["imm"].params, PROBLEM.z).record
+    models = [augmented(theta) for theta in THETA]
+    for run_index in range(RUNS):
+        z = shifted(np.asarray(PROBLEM.z[run_index]))
+        looped = interacting(models, np.asarray(SWITCHING), z, np.asarray(PROBLEM.valid))
+        expected = without_offset(looped)
+        np.testing.assert_allclose(estimate.mean[run_index], expected.mean, atol=1e-10)
+        np.testing.assert_allclose(estimate.cov[run_index], expected.cov, atol=1e-10)
+        np.testing.assert_allclose(
+            info.log_likelihood[run_index], expected.log_likelihood, atol=1e-10
+        )
+
+
 WEIGHTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mmae": bayes_weights,
     "mmae of square roots": bayes_weights,
+    "mmae of ukf": bayes_weights,
     "immae": lambda rows: immae_weights(rows, 5, 0.9),
+    "immae of ckf": lambda rows: immae_weights(rows, 5, 0.9),
     "floor": lambda rows: floor_weights(rows, 1e-3),
     "markov": lambda rows: markov_weights(rows, 0.05),
 }

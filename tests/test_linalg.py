@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.test_util import check_grads
 from oracles.matrices import central_difference, random_spd
 
 from jaxnav.numerics import linalg
@@ -20,7 +21,7 @@ def kernels(batches):
             "upper": linalg.solve_lower_transposed(L, B),
             "log_det": linalg.log_det(L),
             "matmul": linalg.matmul(S, B),
-            "root": linalg.semidefinite_root(S[:3, :3]),
+            "root": linalg.semidefinite_root(S[:3, :3]).factor,
             "tria": linalg.tria(jnp.concatenate([L, B], axis=1)),
         }
 
@@ -191,11 +192,13 @@ def test_root_of_a_singular_matrix():
     @jax.jit
     def root_and_gradient(A):
         def total(a):
-            return jnp.sum(linalg.semidefinite_root(a))
+            return jnp.sum(linalg.semidefinite_root(a).factor)
 
         return jax.vmap(linalg.semidefinite_root)(A), jax.vmap(jax.grad(total))(A)
 
-    L, gradient = map(np.asarray, root_and_gradient(A))
+    root, gradient = root_and_gradient(A)
+    assert np.all(root.semidefinite)
+    L = np.asarray(root.factor)
     np.testing.assert_array_equal(L, np.tril(L))
     np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-13)
     np.testing.assert_allclose(L[1], np.sqrt(A[1]), rtol=1e-14)
@@ -207,8 +210,110 @@ def test_root_of_a_matrix_that_is_singular_to_rounding():
     rng = np.random.default_rng(6)
     axes = np.linalg.qr(rng.standard_normal((50_000, 3, 3)))[0]
     A = (axes * np.array([1.0, 1.0, 0.0])) @ axes.transpose(0, 2, 1)
-    L = np.asarray(jax.jit(jax.vmap(linalg.semidefinite_root))(A))
+    root = jax.jit(jax.vmap(linalg.semidefinite_root))(A)
+    assert np.all(root.semidefinite)
+    L = np.asarray(root.factor)
     np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-13)
+
+
+ROOT_SIZES = (1, 3, 15)
+
+
+def test_root_tells_semidefinite_from_indefinite():
+    """In any units: all of any rank pass, and none with an eigenvalue of -1e-3 of the largest."""
+    rng = np.random.default_rng(8)
+    batches = []
+    for n in (3, 15):
+        axes = np.linalg.qr(rng.standard_normal((200, n, n)))[0]
+        ranks = rng.integers(1, n + 1, (200, 1))
+        values = rng.uniform(0.1, 1, (200, n)) * (np.arange(n) < ranks)
+        negative = np.where(np.arange(n) == n - 1, -1e-3, values)
+        units = 10.0 ** rng.integers(-6, 7, (200, n, 1))
+        for eigenvalues in (values, negative):
+            A = (axes * eigenvalues[:, None]) @ axes.mT
+            batches.append(0.5 * (A + A.mT) * units * units.mT)
+    judged = jax.jit(lambda A: [jax.vmap(linalg.semidefinite_root)(a) for a in A])(batches)
+    for on_cone, beyond in (judged[:2], judged[2:]):
+        assert np.all(on_cone.semidefinite)
+        assert not np.any(beyond.semidefinite)
+
+
+def test_root_of_a_negative_or_missing_variance_is_not_a_number():
+    A = np.stack([np.eye(3)] * 4)
+    A[1, 1, 1], A[2, 2, 2], A[3, 0, 1], A[3, 1, 0] = -1e-12, np.nan, np.nan, np.nan
+    root = jax.jit(jax.vmap(linalg.semidefinite_root))(A)
+    np.testing.assert_array_equal(root.semidefinite, [True, False, False, False])
+    assert np.all(np.isnan(root.factor[1:3]))
+
+
+@jax.jit
+def downdates(pairs):
+    return [jax.vmap(linalg.downdate)(*pair) for pair in pairs]
+
+
+def random_downdates(rng, length):
+    """Return factors ``(COUNT, n, n)`` and vectors ``L u`` with ``|u| = length``, for each size."""
+    pairs = []
+    for n in ROOT_SIZES:
+        L = np.linalg.cholesky(random_spd(rng, COUNT, n))
+        u = rng.standard_normal((COUNT, n, 1))
+        pairs.append((L, (L @ u)[..., 0] * length / np.linalg.norm(u, axis=1)))
+    return pairs
+
+
+def test_downdate_is_the_factor_of_the_difference():
+    pairs = random_downdates(np.random.default_rng(9), 0.8)
+    for (L, v), (factor, sound) in zip(pairs, downdates(pairs), strict=True):
+        assert np.all(sound)
+        expected = np.linalg.cholesky(L @ L.mT - v[:, :, None] * v[:, None])
+        scale = np.abs(expected).max(axis=(1, 2), keepdims=True)
+        np.testing.assert_allclose(factor / scale, expected / scale, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(factor, np.tril(factor))
+
+
+def test_downdate_of_too_much_is_reported_and_of_nothing_is_the_identity():
+    pairs = random_downdates(np.random.default_rng(10), 1.01)
+    nothing = [(L, np.zeros_like(v)) for L, v in pairs]
+    unknown = [(L, np.full_like(v, np.nan)) for L, v in pairs]
+    cases = ((pairs, False), (nothing, True), (unknown, False))
+    for given, sound in cases:
+        for (L, _), out in zip(given, downdates(given), strict=True):
+            np.testing.assert_array_equal(out.semidefinite, sound)
+            np.testing.assert_array_equal(out.factor, L)
+
+
+def test_downdate_of_a_singular_factor():
+    """A state without variance allows nothing to be taken from it, and is no obstacle."""
+    L = np.linalg.cholesky(random_spd(np.random.default_rng(11), COUNT, 3))
+    L[:, 1] = 0
+    v = L[:, :, 0] * 0.5
+    touched = v.copy()
+    touched[:, 1] = 1e-3
+    (factor, sound), (kept, refused) = downdates([(L, v), (L, touched)])
+    assert np.all(sound)
+    assert not np.any(refused)
+    np.testing.assert_allclose(
+        factor @ factor.mT, L @ L.mT - v[:, :, None] * v[:, None], atol=1e-13
+    )
+    np.testing.assert_array_equal(kept, L)
+
+
+def test_derivatives_of_downdate():
+    """By central differences in both modes; at ``v = 0`` and where it fails they are finite."""
+    rng = np.random.default_rng(12)
+    L, v = (jnp.asarray(part[:4]) for part in random_downdates(rng, 0.6)[1])
+    weight = jnp.asarray(rng.standard_normal((3, 3)))
+
+    @jax.jit
+    def total(L, v):
+        return jnp.sum(weight * linalg.downdate(L, v).factor)
+
+    check_grads(jax.vmap(total), (L, v), order=1, modes=["fwd", "rev"], rtol=1e-7, atol=1e-7)
+    by_both = jax.jit(jax.vmap(jax.grad(total, argnums=(0, 1))))
+    of_L, of_v = by_both(L, 0 * v)
+    np.testing.assert_allclose(of_L, jnp.tril(weight)[None] + 0 * L, atol=1e-15)
+    np.testing.assert_allclose(of_v, 0, atol=1e-15)
+    assert all(np.all(np.isfinite(g)) for g in by_both(L, 9 * v))
 
 
 def test_gradient_of_safe_norm_at_zero_and_beyond():

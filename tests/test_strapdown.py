@@ -11,7 +11,6 @@ from jaxnav.navigation.models.sins_cns import (
     LAYOUT,
     SinsCnsParams,
     inputs_from_solution,
-    misalignment,
     sins_cns,
 )
 from jaxnav.navigation.strapdown import (
@@ -21,13 +20,13 @@ from jaxnav.navigation.strapdown import (
     rotation_compensated,
 )
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
-from jaxnav.numerics.lie import so3_exp
+from jaxnav.numerics.lie import so3_exp, so3_local
 from jaxnav.units import ARCSEC
 
 RADIUS = 6.371e6
 STEP = 0.01
 mechanise = jax.jit(mechanise_launch_inertial, static_argnames=("step", "every"))
-tilts = jax.jit(jax.vmap(misalignment))
+tilts = jax.jit(jax.vmap(so3_local))
 
 
 @cache
@@ -103,7 +102,7 @@ def mechanised_errors(truth, small):
 
     def column(error):
         plus, minus = run(error), run(-error)
-        phi = misalignment(plus.dcm, minus.dcm)
+        phi = so3_local(minus.dcm, plus.dcm)
         dv, dr = plus.velocity - minus.velocity, plus.position - minus.position
         return jnp.concatenate([0.5 * phi, 0.5 * dv, 0.5 * dr, error[s.eps], error[s.nabla]])
 

@@ -100,6 +100,16 @@ def so3_log(C: Array) -> Array:
     return v * jnp.where(negative, -factor, factor)
 
 
+def so3_retract(C: Array, phi: Array) -> Array:
+    """Return ``exp([phi]x) C``: the attitude C_ib ``(3, 3)`` turned about inertial axes."""
+    return matmul(so3_exp(phi), C)
+
+
+def so3_local(C: Array, D: Array) -> Array:
+    """Return phi ``(3,) [rad]`` with ``D = exp([phi]x) C``; inverse of :func:`so3_retract`."""
+    return so3_log(matmul(D, C.T))
+
+
 def _largest_component_quaternion(C: Array) -> Array:
     """Return the unit quaternion ``(4,)``, scalar first, of a rotation matrix."""
     xx, yy, zz = C[0, 0], C[1, 1], C[2, 2]
@@ -149,6 +159,11 @@ def euler_from_dcm(C: Array) -> Array:
             jnp.arctan2(C[2, 1], C[2, 2]),
         ]
     )
+
+
+def wrapped_angle(z: Array, reference: Array) -> Array:
+    """Return the differences ``z - reference`` of angles [rad], in [-pi, pi)."""
+    return jnp.mod(z - reference + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 
 def euler_error_from_rotation(C: Array) -> Array:

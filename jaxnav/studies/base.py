@@ -41,6 +41,58 @@ def require_finite(config: Any) -> None:
                 require(math.isfinite(entry), name, value, "finite")
 
 
+def require_runs(config: Any) -> None:
+    """Require that ``runs`` and ``seed`` make a Monte Carlo study."""
+    require(config.runs >= 1, "runs", config.runs, "at least 1")
+    require(0 <= config.seed < 2**63, "seed", config.seed, "between 0 and 2**63 - 1")
+
+
+def require_probability(config: Any, *names: str) -> None:
+    """Require that fields lie strictly between 0 and 1."""
+    for name in names:
+        value = getattr(config, name)
+        require(0 < value < 1, name, value, "between 0 and 1")
+
+
+def require_reset(config: Any, shortest_s: float) -> None:
+    """Require that ``reset_period_s`` and ``reset_threshold`` fit the windowed reset."""
+    require(
+        config.reset_period_s >= shortest_s,
+        "reset_period_s",
+        config.reset_period_s,
+        f"at least one filter period of {shortest_s} s",
+    )
+    require(0 < config.reset_threshold <= 1, "reset_threshold", config.reset_threshold, "in (0, 1]")
+
+
+def require_weight_floor(config: Any, models: int) -> None:
+    """Require that ``weight_floor`` is below the equal weight of so many models."""
+    require(
+        0 < config.weight_floor < 1 / models,
+        "weight_floor",
+        config.weight_floor,
+        f"positive and below 1 / {models}, the equal weight",
+    )
+
+
+def require_flight_times(config: Any) -> None:
+    """Require that rates, filter period and duration of a simulated flight fit together."""
+    require(abs(config.latitude_deg) <= 90, "latitude_deg", config.latitude_deg, "within +-90")
+    per_period = config.filter_period_s * config.ins_rate_hz
+    require(
+        per_period >= 1 - 1e-9 and abs(per_period - round(per_period)) < 1e-9 * per_period,
+        "filter_period_s",
+        config.filter_period_s,
+        f"a whole number of inertial samples of {1 / config.ins_rate_hz:g} s",
+    )
+    require(
+        config.duration_s >= config.filter_period_s,
+        "duration_s",
+        config.duration_s,
+        f"at least one filter period of {config.filter_period_s} s",
+    )
+
+
 def require_x64() -> None:
     """Raise :class:`ConfigError` if JAX is set to 32-bit floats.
 

@@ -29,19 +29,61 @@ def kalman(model: Linear, z: np.ndarray, valid: np.ndarray) -> History:
     x, P = model.x0, model.P0
     means, covs, likelihoods = [], [], []
     for k in range(len(z)):
-        x = model.Phi[k] @ x
-        P = model.Phi[k] @ P @ model.Phi[k].T + model.Q[k]
-        H, R = model.H[valid[k]], model.R[np.ix_(valid[k], valid[k])]
-        S = H @ P @ H.T + R
-        nu = z[k][valid[k]] - H @ x
-        K = P @ H.T @ np.linalg.inv(S)
-        x = x + K @ nu
-        A = np.eye(len(x)) - K @ H
-        P = A @ P @ A.T + K @ R @ K.T
-        quadratic = nu @ np.linalg.solve(S, nu)
-        likelihoods.append(-0.5 * (quadratic + np.linalg.slogdet(2 * np.pi * S)[1]))
+        x, P, likelihood = kalman_step(model, k, x, P, z[k], valid[k])
+        likelihoods.append(likelihood)
         means.append(x)
         covs.append(P)
+    return History(np.array(means), np.array(covs), np.array(likelihoods))
+
+
+def kalman_step(
+    model: Linear, k: int, x: np.ndarray, P: np.ndarray, z: np.ndarray, valid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Predict and update over step ``k``; return mean, covariance and log-likelihood."""
+    x = model.Phi[k] @ x
+    P = model.Phi[k] @ P @ model.Phi[k].T + model.Q[k]
+    H, R = model.H[valid], model.R[np.ix_(valid, valid)]
+    S = H @ P @ H.T + R
+    nu = z[valid] - H @ x
+    K = P @ H.T @ np.linalg.inv(S)
+    A = np.eye(len(x)) - K @ H
+    quadratic = nu @ np.linalg.solve(S, nu)
+    likelihood = -0.5 * (quadratic + np.linalg.slogdet(2 * np.pi * S)[1])
+    return x + K @ nu, A @ P @ A.T + K @ R @ K.T, float(likelihood)
+
+
+def interacting(
+    models: list[Linear], transition: np.ndarray, z: np.ndarray, valid: np.ndarray
+) -> History:
+    """Run the interacting multiple model filter of Bar-Shalom, Li, Kirubarajan, section 11.6.6.
+
+    From equal probabilities; the log-likelihood is that of the mixture of predictions.
+    """
+    members = range(len(models))
+    mu = np.ones(len(models)) / len(models)
+    x, P = [m.x0 for m in models], [m.P0 for m in models]
+    means, covs, likelihoods = [], [], []
+    for k in range(len(z)):
+        c = np.array([sum(transition[i, j] * mu[i] for i in members) for j in members])
+        x0, P0 = [], []
+        for j in members:
+            share = [transition[i, j] * mu[i] / c[j] for i in members]
+            mixed = sum(share[i] * x[i] for i in members)
+            x0.append(mixed)
+            P0.append(
+                sum(
+                    share[i] * (P[i] + np.outer(x[i] - mixed, x[i] - mixed))
+                    for i in members
+                )
+            )
+        steps = [kalman_step(models[j], k, x0[j], P0[j], z[k], valid[k]) for j in members]
+        x, P, rows = (list(part) for part in zip(*steps, strict=True))
+        joint = np.exp(rows) * c
+        likelihoods.append(np.log(joint.sum()))
+        mu = joint / joint.sum()
+        mean = sum(mu[j] * x[j] for j in members)
+        covs.append(sum(mu[j] * (P[j] + np.outer(x[j] - mean, x[j] - mean)) for j in members))
+        means.append(mean)
     return History(np.array(means), np.array(covs), np.array(likelihoods))
 
 

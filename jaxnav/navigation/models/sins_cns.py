@@ -21,7 +21,7 @@ from jax import Array
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import gravity_gradient_launch_inertial
 from jaxnav.navigation.strapdown import NavSolution, NavState
-from jaxnav.numerics.lie import skew, so3_log
+from jaxnav.numerics.lie import skew
 from jaxnav.numerics.linalg import matmul
 
 
@@ -103,11 +103,6 @@ def inputs_from_solution(
         ),
         true_scale=true_scale,
     )
-
-
-def misalignment(dcm_computed: Array, dcm_reference: Array) -> Array:
-    """Return phi ``(3,) [rad]`` with ``C_computed = exp([phi]x) C_reference``."""
-    return so3_log(matmul(dcm_computed, dcm_reference.T))
 
 
 def sins_cns(period: float, imu_step: float) -> Model:

@@ -25,7 +25,10 @@ from jaxnav.numerics.lie import (
     euler_from_dcm,
     so3_exp,
     so3_left_jacobian,
+    so3_local,
     so3_log,
+    so3_retract,
+    wrapped_angle,
 )
 from jaxnav.numerics.linalg import matmul
 
@@ -87,7 +90,7 @@ def retract(x: SinsTotal, dx: Array) -> SinsTotal:
     """Return the state displaced by a tangent vector ``(15,)``."""
     s = LAYOUT
     return SinsTotal(
-        dcm=matmul(so3_exp(dx[s.phi]), x.dcm),
+        dcm=so3_retract(x.dcm, dx[s.phi]),
         velocity=x.velocity + dx[s.dv],
         position=x.position + dx[s.dr],
         drift=x.drift + dx[s.eps],
@@ -99,7 +102,7 @@ def local(x: SinsTotal, y: SinsTotal) -> Array:
     """Return the tangent vector ``(15,)`` from ``x`` to ``y``."""
     return jnp.concatenate(
         [
-            so3_log(matmul(y.dcm, x.dcm.T)),
+            so3_local(x.dcm, y.dcm),
             y.velocity - x.velocity,
             y.position - x.position,
             y.drift - x.drift,
@@ -189,9 +192,7 @@ def sins_total(
 
         return moved, observed(x)
 
-    return Model(
-        transition, process_noise, observe, noise, residual, retract, local, jacobians
-    )
+    return Model(transition, process_noise, observe, noise, residual, retract, local, jacobians)
 
 
 def _rotated(C: Array, variances: Array) -> Array:
@@ -205,7 +206,7 @@ def _rotation_vector(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -
 
 
 def _rotation_between(z: Array, z_pred: Array) -> Array:
-    return so3_log(matmul(so3_exp(z), so3_exp(z_pred).T))
+    return so3_local(so3_exp(z_pred), so3_exp(z))
 
 
 def _isotropic_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
@@ -223,10 +224,6 @@ def _euler_angles(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> A
     return euler_from_dcm(x.dcm)
 
 
-def _wrapped(z: Array, z_pred: Array) -> Array:
-    return jnp.mod(z - z_pred + jnp.pi, 2 * jnp.pi) - jnp.pi
-
-
 def _euler_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
     del u
     return _rotated(euler_error_from_rotation(x.dcm), params.star_noise**2)
@@ -239,5 +236,5 @@ def _euler_part(x: SinsTotal) -> Callable[[Array], Array]:
 
 _STAR = {
     "rotation-vector": (_rotation_vector, _rotation_between, _isotropic_noise, _attitude_part),
-    "euler": (_euler_angles, _wrapped, _euler_noise, _euler_part),
+    "euler": (_euler_angles, wrapped_angle, _euler_noise, _euler_part),
 }

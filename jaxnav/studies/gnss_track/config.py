@@ -4,7 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from jaxnav.studies.base import require, require_choice, require_finite, require_positive
+from jaxnav.studies.base import (
+    require,
+    require_choice,
+    require_finite,
+    require_positive,
+    require_probability,
+    require_reset,
+    require_weight_floor,
+)
 
 SCENARIOS = {
     "full-rate": "every fix of the log",
@@ -57,14 +65,9 @@ class GnssTrackConfig:
         require_positive(self, "q")
         names = self.single_ids
         require(len(set(names)) == len(names), "q", self.q, "different in every entry")
-        require(0 < self.reset_threshold <= 1, "reset_threshold", self.reset_threshold, "in (0, 1]")
-        require(
-            0 < self.weight_floor < 1 / len(self.q),
-            "weight_floor",
-            self.weight_floor,
-            f"positive and below 1 / {len(self.q)}, the equal weight",
-        )
-        require(0 < self.switching < 1, "switching", self.switching, "between 0 and 1")
+        require_reset(self, 0.0)
+        require_weight_floor(self, len(self.q))
+        require_probability(self, "switching")
 
     @property
     def single_ids(self) -> tuple[str, ...]:

@@ -6,9 +6,10 @@ import numpy as np
 
 from jaxnav.estimation.metrics import mean_interval, rmse_ratio
 from jaxnav.estimation.montecarlo import Campaign
+from jaxnav.studies.attitude import AXES
 from jaxnav.studies.base import Claim, plain, verdict
 from jaxnav.studies.immae.config import ImmaeConfig
-from jaxnav.studies.immae.methods import AXES, BANKS, METHODS
+from jaxnav.studies.immae.methods import BANKS, METHODS
 from jaxnav.units import ARCSEC
 
 PUBLISHED = {

@@ -3,7 +3,17 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxnav.studies.base import require, require_choice, require_finite, require_positive
+from jaxnav.studies.base import (
+    require,
+    require_choice,
+    require_finite,
+    require_flight_times,
+    require_positive,
+    require_probability,
+    require_reset,
+    require_runs,
+    require_weight_floor,
+)
 
 SCENARIOS = {
     "matched-noise": "simulation 1: true noise Q0 throughout, single Kalman filter at 4 Q0",
@@ -87,42 +97,17 @@ class ImmaeConfig:
         """
         require_choice(self, "scenario", "chain", "initial")
         require_finite(self)
-        require(self.runs >= 1, "runs", self.runs, "at least 1")
-        require(0 <= self.seed < 2**63, "seed", self.seed, "between 0 and 2**63 - 1")
+        require_runs(self)
         require_positive(self, *_POSITIVE)
+        require_flight_times(self)
         for name in ("gyro_noise_deg_h", "accel_noise_ug"):
             value = getattr(self, name)
             require(0 <= value < float("inf"), name, value, "zero or positive")
-        require(abs(self.latitude_deg) <= 90, "latitude_deg", self.latitude_deg, "within +-90")
         if self.kf_theta is not None:
             require(self.kf_theta > 0, "kf_theta", self.kf_theta, "positive")
-        require(0 < self.reset_threshold <= 1, "reset_threshold", self.reset_threshold, "in (0, 1]")
-        require(
-            self.reset_period_s >= self.filter_period_s,
-            "reset_period_s",
-            self.reset_period_s,
-            f"at least one filter period of {self.filter_period_s} s",
-        )
-        require(
-            0 < self.weight_floor < 1 / len(self.theta),
-            "weight_floor",
-            self.weight_floor,
-            f"positive and below 1 / {len(self.theta)}, the equal weight",
-        )
-        require(0 < self.switching < 1, "switching", self.switching, "between 0 and 1")
-        per_period = self.filter_period_s * self.ins_rate_hz
-        require(
-            per_period >= 1 - 1e-9 and abs(per_period - round(per_period)) < 1e-9 * per_period,
-            "filter_period_s",
-            self.filter_period_s,
-            f"a whole number of inertial samples of {1 / self.ins_rate_hz:g} s",
-        )
-        require(
-            self.duration_s >= self.filter_period_s,
-            "duration_s",
-            self.duration_s,
-            f"at least one filter period of {self.filter_period_s} s",
-        )
+        require_reset(self, self.filter_period_s)
+        require_weight_floor(self, len(self.theta))
+        require_probability(self, "switching")
 
     @property
     def steps(self) -> int:

@@ -50,9 +50,6 @@ RULES: dict[str, WeightRule] = {
 }
 METHODS = tuple(RULES)
 BANKS = ("mmae", "immae", "floor", "markov")
-AXES = ("yaw", "pitch", "roll")
-DIVERGED_SIGMAS = 5.0
-"""A method diverged in a run whose final attitude error exceeds this many star-tracker sigmas."""
 
 
 class Member(NamedTuple):

@@ -13,7 +13,6 @@ from jaxnav.navigation.models.sins_cns import (
     SinsCnsInput,
     SinsCnsParams,
     inputs_from_solution,
-    misalignment,
     sins_cns,
 )
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
@@ -26,7 +25,7 @@ from jaxnav.navigation.strapdown import (
 )
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
-from jaxnav.numerics.lie import euler_error_from_rotation, so3_exp
+from jaxnav.numerics.lie import euler_error_from_rotation, so3_exp, so3_local
 from jaxnav.numerics.linalg import matmul
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.units import ARCSEC, DEG, DEG_PER_HOUR, MICRO_G
@@ -195,7 +194,7 @@ def fly_sins(key: Array, world: World, period: float, imu_step: float) -> Run:
     star = observe_attitude(star_key, world.dcm, world.noise.star_noise)
     return Run(
         inputs=inputs_from_solution(start, solution, period, world.radius, world.step_scale),
-        z=jax.vmap(misalignment)(solution.state.dcm, star),
+        z=jax.vmap(so3_local)(star, solution.state.dcm),
         error=_solution_error(solution.state, world, error0, every),
     )
 
@@ -206,7 +205,7 @@ def _solution_error(state: NavState, world: World, error0: Array, every: int) ->
     constant = jnp.broadcast_to(error0[LAYOUT.eps.start :], (truth.dcm.shape[0], 6))
     return jnp.concatenate(
         [
-            jax.vmap(misalignment)(state.dcm, truth.dcm),
+            jax.vmap(so3_local)(truth.dcm, state.dcm),
             state.velocity - truth.velocity,
             state.position - truth.position,
             constant,

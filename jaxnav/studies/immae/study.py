@@ -7,15 +7,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxnav.estimation.metrics import rmse, trmse
+from jaxnav.estimation.metrics import trmse
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
+from jaxnav.studies.attitude import AXES, attitude_measures
 from jaxnav.studies.base import StudyResult, plain, require_x64
 from jaxnav.studies.immae.claims import PUBLISHED, assess
 from jaxnav.studies.immae.config import SCENARIOS, ImmaeConfig
 from jaxnav.studies.immae.methods import (
-    AXES,
     BANKS,
-    DIVERGED_SIGMAS,
     METHODS,
     Shared,
     panel_params,
@@ -93,24 +92,15 @@ def run_campaign(config: ImmaeConfig, **options: Any) -> Campaign:
 
 def _measures(config: ImmaeConfig, campaign: Campaign) -> dict[str, dict[str, Any]]:
     rows = campaign.rows
-    limit = DIVERGED_SIGMAS * config.star_noise_arcsec * ARCSEC
-    measures: dict[str, dict[str, Any]] = {}
-    for i, name in enumerate(METHODS):
-        lost = ~np.all(np.isfinite(rows.mean_square[:, i]), axis=-1)
-        lost |= ~(rows.final_error[:, i] <= limit)
-        axes = {
-            axis: {**rmse(rows.mean_square[:, i, j] / ARCSEC**2)._asdict(), "unit": "arcsec"}
-            for j, axis in enumerate(AXES)
-        }
-        mean = rmse(rows.mean_square[:, i].mean(axis=-1) / ARCSEC**2)
-        measures[name] = {
-            "rmse": axes,
-            "rmse_all": {**mean._asdict(), "unit": "arcsec"},
-            "anees": float(rows.nees[:, i].mean()),
-            "anees_dof": 3,
-            "diverged": int(lost.sum()),
-        }
-    return measures
+    return {
+        name: attitude_measures(
+            rows.mean_square[:, i],
+            rows.nees[:, i],
+            rows.final_error[:, i],
+            config.star_noise_arcsec * ARCSEC,
+        )
+        for i, name in enumerate(METHODS)
+    }
 
 
 def _arrays(config: ImmaeConfig, campaign: Campaign) -> dict[str, Any]:
