@@ -25,6 +25,12 @@ COLOURS = {
     "immae": "tab:blue",
     "floor": "tab:green",
     "markov": "tab:purple",
+    "ekf": "tab:red",
+    "ukf": "tab:pink",
+    "mmae-ekf": "tab:orange",
+    "mmae-ukf": "tab:olive",
+    "immae-ukf": "tab:blue",
+    "imm-ukf": "tab:purple",
     "oracle": "black",
 }
 """Colour of each method, the same in all figures."""

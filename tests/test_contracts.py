@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
-from jax.test_util import check_grads
 
 from jaxnav.estimation.banks.imm import imm, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, bank, immae, mmae
@@ -38,6 +37,7 @@ from tests.oracles.kalman import (
     markov_weights,
     mixture,
 )
+from tests.oracles.matrices import central_difference
 
 STEPS, RUNS, STATES, CHANNELS = 12, 6, 4, 2
 THETA = (0.2, 1.0, 8.0)
@@ -332,7 +332,7 @@ def test_dtype_in_is_dtype_out(name: str) -> None:
 
     compiled = jax.jit(step)(narrow)
     for leaf in jax.tree.leaves(compiled):
-        assert leaf.dtype in (jnp.float32, jnp.int32), leaf
+        assert leaf.dtype in (jnp.float32, jnp.int32, jnp.bool_), leaf
     if name in ("kf", "square_root_kf"):
         # op by op is slow; the banks are these kernels under vmap
         for a, b in zip(jax.tree.leaves(step(narrow)), jax.tree.leaves(compiled), strict=True):
@@ -346,19 +346,36 @@ def test_second_call_does_not_trace_again(name: str) -> None:
     assert _TRACED[name] == 1
 
 
+BOTH_MODES = ("kf", "square_root_kf", "ukf", "imm")
+"""Forward mode differentiates what reverse mode transposes; one of each kind is worth its compile."""
+
+
 @each_case
 def test_gradient_of_the_likelihood(name: str) -> None:
+    """By the factors on Q and R, against central differences of the compiled run."""
     filter, params, _ = CASES[name]
     observations = Obs(PROBLEM.z[0], PROBLEM.valid)
+    point = jnp.array([0.1, -0.2])
 
-    def loss(log_noise: Array) -> Array:
+    def noisy(log_noise: Array) -> Any:
         factors = jnp.exp(log_noise)
         inner = params.members if isinstance(params, BankParams) else params
         moved = inner._replace(model=Noise(inner.model.q * factors[0], inner.model.r * factors[1]))
-        whole = params._replace(members=moved) if isinstance(params, BankParams) else moved
-        return negative_log_likelihood(filter, whole, PROBLEM.inputs, observations)
+        return params._replace(members=moved) if isinstance(params, BankParams) else moved
 
-    check_grads(jax.jit(loss), (jnp.array([0.1, -0.2]),), order=1, modes=["fwd", "rev"], rtol=1e-7)
+    def loss(log_noise: Array) -> Array:
+        return negative_log_likelihood(filter, noisy(log_noise), PROBLEM.inputs, observations)
+
+    def values(log_noise: np.ndarray) -> np.ndarray:
+        _, info = batch_run(name, noisy(jnp.asarray(log_noise)), PROBLEM.z).record
+        return -np.mean(info.log_likelihood[0])
+
+    expected = [central_difference(values, np.asarray(point), e, 1e-3) for e in np.eye(2)]
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(point), expected, rtol=1e-9, atol=1e-10)
+    if name in BOTH_MODES:
+        np.testing.assert_allclose(
+            jax.jit(jax.jacfwd(loss))(point), expected, rtol=1e-9, atol=1e-10
+        )
 
 
 def test_covariance_is_shared_by_runs_that_share_their_inputs() -> None:
@@ -396,3 +413,51 @@ def test_run_refuses_lengths_that_differ() -> None:
     case = CASES["kf"]
     with pytest.raises(ValueError, match=r"\[11, 12\] steps"):
         run(case.filter, case.params, PROBLEM.inputs, Obs(PROBLEM.z[0, 1:], PROBLEM.valid[1:]))
+
+
+def _misfits() -> dict[str, tuple[Model, FilterParams, Obs, str]]:
+    """Models, parameters and data that do not fit together, and what is said about them."""
+    model, params, obs = dense_model(), single(), Obs(PROBLEM.z[0], PROBLEM.valid)
+    wide = Obs(jnp.zeros((STEPS, 3)), jnp.ones((STEPS, 3), bool))
+    prior = params.initial._replace(cov=jnp.eye(3))
+    return {
+        "prior": (model, params._replace(initial=prior), obs, r"\(3, 3\).*\(4, 4\)"),
+        "data": (model, params, wide, r"z \(3,\) and valid \(3,\).*\(2,\)"),
+        "mask": (model, params, obs._replace(valid=wide.valid), r"valid \(3,\).*\(2,\)"),
+        "R": (
+            model._replace(observation_noise=lambda p, x, u: jnp.eye(3)),
+            params,
+            obs,
+            r"\(3, 3\).*\(2, 2\) or \(2,\)",
+        ),
+        "diagonal of R": (
+            model._replace(observation_noise=lambda p, x, u: jnp.ones(4)),
+            params,
+            obs,
+            r"\(4,\).*\(2, 2\) or \(2,\)",
+        ),
+        "Q": (
+            model._replace(process_noise=lambda p, x, u: jnp.eye(3)),
+            params,
+            obs,
+            r"\(3, 3\).*\(4, 4\)",
+        ),
+        "transition": (
+            model._replace(transition=lambda p, x, u: x[:3]),
+            params,
+            obs,
+            r"\(4,\) to \(3,\)",
+        ),
+    }
+
+
+MISFITS = _misfits()
+BUILDERS = (ekf, square_root_ekf, ukf, square_root_ukf)
+
+
+@pytest.mark.parametrize("build", BUILDERS)
+@pytest.mark.parametrize("wrong", MISFITS)
+def test_shapes_that_do_not_fit_are_named(build: Callable[[Model], Filter], wrong: str) -> None:
+    model, params, obs, message = MISFITS[wrong]
+    with pytest.raises(ValueError, match=message):
+        run(build(model), params, PROBLEM.inputs, obs)

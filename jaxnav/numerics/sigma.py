@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-import jax
 from jax import Array
+from jax.core import Tracer
 
 
 class SigmaRule(NamedTuple):
@@ -44,7 +44,7 @@ def unscented(
         al. (2018), Eqs. (13)-(22), where ``w_i`` is printed ``1 (2 (n + lambda))``.
     """
     total = alpha**2 * (n + kappa)
-    if not isinstance(total, jax.core.Tracer) and not total > 0:
+    if not isinstance(total, Tracer) and not total > 0:
         raise ValueError(
             f"alpha = {alpha}, kappa = {kappa} give n + lambda = alpha^2 (n + kappa) = {total} for "
             f"n = {n} states; it must be positive: alpha not zero and kappa above {-n}"

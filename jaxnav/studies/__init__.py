@@ -42,6 +42,14 @@ STUDIES = {
         scenarios="jaxnav.studies.immae.config:SCENARIOS",
         check="jaxnav.studies.immae.study:check",
     ),
+    "mmae-ukf": Study(
+        summary="banks of EKF and UKF on a 300 s boost, total-state SINS/CNS (Zhao, Chen, He, Ge)",
+        config="jaxnav.studies.mmae_ukf.config:MmaeUkfConfig",
+        entry="jaxnav.studies.mmae_ukf.study:run_study",
+        figures="jaxnav.studies.mmae_ukf.figures:draw",
+        scenarios="jaxnav.studies.mmae_ukf.config:SCENARIOS",
+        check="jaxnav.studies.mmae_ukf.study:check",
+    ),
     "gnss-track": Study(
         summary="a recorded GNSS track through the same bank, judged by predictive likelihood",
         config="jaxnav.studies.gnss_track.config:GnssTrackConfig",

@@ -132,6 +132,21 @@ class Claim:
     why: str
 
 
+def untested(config: Any, free: tuple[str, ...]) -> str | None:
+    """Return what keeps a configuration from testing a paper's claims, if anything does.
+
+    Args:
+        config: The configuration; the paper's scenario is its class with no arguments.
+        free: Fields a test of the claims may vary: the size of the study and what the paper leaves
+            open.
+    """
+    if config.runs < 2:
+        return "one run has no interval"
+    paper, given = plain(type(config)()), plain(config)
+    changed = [name for name in paper if name not in free and paper[name] != given[name]]
+    return f"{', '.join(changed)} differ from the paper's scenario" if changed else None
+
+
 def verdict(holds: bool) -> str:
     """Return the word for a claim that holds or does not."""
     return "reproduced" if holds else "not reproduced"

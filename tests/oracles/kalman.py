@@ -71,10 +71,7 @@ def interacting(
             mixed = sum(share[i] * x[i] for i in members)
             x0.append(mixed)
             P0.append(
-                sum(
-                    share[i] * (P[i] + np.outer(x[i] - mixed, x[i] - mixed))
-                    for i in members
-                )
+                sum(share[i] * (P[i] + np.outer(x[i] - mixed, x[i] - mixed)) for i in members)
             )
         steps = [kalman_step(models[j], k, x0[j], P0[j], z[k], valid[k]) for j in members]
         x, P, rows = (list(part) for part in zip(*steps, strict=True))

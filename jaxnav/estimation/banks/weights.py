@@ -157,8 +157,8 @@ class Switched(NamedTuple):
 
     Attributes:
         log_weights: ``(M,)`` of the models after the step.
-        origins: ``(M, M)``; ``origins[i, j]`` is that of having been in model ``i``, given ``j`` now;
-            a model that cannot be reached comes from itself.
+        origins: ``(M, M)``; ``origins[i, j]`` is that of having been in model ``i``, given that
+            it is ``j`` now; a model that cannot be reached comes from itself.
     """
 
     log_weights: Array

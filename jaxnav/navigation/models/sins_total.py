@@ -3,8 +3,8 @@
 The state is the navigation solution itself, driven by the increments of the inertial sensors:
 attitude C_ib, velocity, position, gyro drift eps and accelerometer error nabla (body axes, measured
 minus true), the last a first-order Markov process. Its tangent space has fifteen coordinates in the
-blocks of :data:`~jaxnav.navigation.models.sins_cns.LAYOUT`; the attitude's is the small rotation phi
-in inertial axes with ``C_computed = exp([phi]x) C_true``.
+blocks of :data:`~jaxnav.navigation.models.sins_cns.LAYOUT`; the attitude's is the small rotation
+phi in inertial axes with ``C_computed = exp([phi]x) C_true``.
 
 References:
     Zhao, Chen, He, Ge (2018), IEEE/CAA JAS 5(6), Eqs. (31)-(40). The paper never states its state
@@ -78,7 +78,7 @@ class SinsTotalInput(NamedTuple):
         dtheta: ``(3,) [rad]`` rotation vector of the body over the period.
         dvel: ``(3,) [m/s]`` integral of the specific force in the body axes of the period's start
             (see :func:`~jaxnav.navigation.strapdown.accumulate`).
-        true_scale: True factor on the variances of the inertial noises, for an informed filter only.
+        true_scale: True factor on the variances of both noises, for an informed filter only.
     """
 
     dtheta: Array

@@ -7,7 +7,7 @@ import numpy as np
 from jaxnav.estimation.metrics import mean_interval, rmse_ratio
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.studies.attitude import AXES
-from jaxnav.studies.base import Claim, plain, verdict
+from jaxnav.studies.base import Claim, untested, verdict
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.methods import BANKS, METHODS
 from jaxnav.units import ARCSEC
@@ -55,19 +55,10 @@ def assess(config: ImmaeConfig, campaign: Campaign) -> list[Claim]:
         claims.append(_first_model_chosen(config, campaign))
     elif len(config.theta) > 1:
         claims += [_second_model_chosen(config, campaign), _mmae_is_slow(config, campaign)]
-    reason = _why_not_testable(config)
+    reason = untested(config, FREE)
     if reason is None:
         return claims
     return [replace(claim, verdict="not testable", why=reason) for claim in claims]
-
-
-def _why_not_testable(config: ImmaeConfig) -> str | None:
-    """Return what keeps a configuration from testing the paper's claims, if anything does."""
-    if config.runs < 2:
-        return "one run has no interval"
-    paper, given = plain(ImmaeConfig()), plain(config)
-    changed = [name for name in paper if name not in FREE and paper[name] != given[name]]
-    return f"{', '.join(changed)} differ from the paper's scenario" if changed else None
 
 
 def _squares(campaign: Campaign, method: str, axis: str) -> np.ndarray:

@@ -114,7 +114,7 @@ class MmaeUkfConfig:
         )
         scored = self.scenario in ("large-misalignment", "all")
         require(
-            0 <= self.settle_s and (not scored or self.settle_s < self.duration_s),
+            self.settle_s >= 0 and (not scored or self.settle_s < self.duration_s),
             "settle_s",
             self.settle_s,
             f"between 0 and the flight time of {self.duration_s} s",

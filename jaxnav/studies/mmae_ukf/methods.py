@@ -41,7 +41,6 @@ from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import (
     SinsTotal,
     SinsTotalInput,
-    SinsTotalParams,
     StarForm,
     sins_total,
 )
@@ -196,11 +195,17 @@ def _members(
     return Member(FilterParams(scaled, initial), last & told)
 
 
-def _started(params: BankParams, start: SinsTotal) -> BankParams:
-    """Return the parameters with members that all start from one state."""
-    members = params.members
-    initial = members.filter.initial._replace(mean=replicate(start, members.told.shape[0]))
-    return params._replace(members=members._replace(filter=members.filter._replace(initial=initial)))
+def started(params: Any, start: SinsTotal) -> Any:
+    """Return the parameters of a bank or of one member, its filters starting from one state."""
+    if isinstance(params, BankParams):
+        count = params.members.told.shape[0]
+        return params._replace(members=_restarted(params.members, replicate(start, count)))
+    return _restarted(params, start)
+
+
+def _restarted(member: Member, mean: SinsTotal) -> Member:
+    initial = member.filter.initial._replace(mean=mean)
+    return member._replace(filter=member.filter._replace(initial=initial))
 
 
 class _Seen(NamedTuple):
@@ -252,7 +257,7 @@ def run_one(setup: Setup, models: int) -> Any:
         flight = fly(key, world, setup.period, setup.imu_step, setup.star)
         observations = Obs(flight.z, jnp.ones(flight.z.shape, bool))
         seen = [
-            run(filter, _started(params, flight.start), flight.inputs, observations, record=record)
+            run(filter, started(params, flight.start), flight.inputs, observations, record=record)
             for (filter, record), params in zip(families, shared[1:], strict=True)
         ]
         attitude, weights = jax.tree.map(
@@ -275,14 +280,19 @@ def _judge(
     error = error[..., jnp.array([1, 0, 2])]
     consistency = jax.vmap(jax.vmap(nees))(rotation, attitude.cov)
     size = jnp.sqrt(jnp.sum(rotation**2, axis=-1))
-    outside = ~(size <= DIVERGED_SIGMAS * world.noise.star_noise[0])
-    after = jnp.arange(1, size.shape[0] + 1)[:, None]
     row = Row(
         mean_square=jnp.mean(error[setup.scored_from :] ** 2, axis=0),
         nees=jnp.mean(consistency[setup.scored_from :], axis=0),
         final_error=size[-1],
-        settled=jnp.max(jnp.where(outside, after, 0), axis=0),
+        settled=steps_outside(size, world),
     )
     sigma = jnp.sqrt(jnp.diagonal(attitude.cov, axis1=-2, axis2=-1))
     curve = {"square": error**2, "nees": consistency, "weights": weights}
     return RunOutput(row, curve, {"error": error, "weights": weights, "sigma": sigma})
+
+
+def steps_outside(size: Array, world: World) -> Array:
+    """Return after how many steps attitude errors ``(K, ...) [rad]`` stay within the band."""
+    outside = ~(size <= DIVERGED_SIGMAS * world.noise.star_noise[0])
+    after = jnp.arange(1, size.shape[0] + 1).reshape(-1, *[1] * (size.ndim - 1))
+    return jnp.max(jnp.where(outside, after, 0), axis=0)

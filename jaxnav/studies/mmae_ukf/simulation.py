@@ -146,9 +146,8 @@ def fly(key: Array, world: World, period: float, imu_step: float, star: StarForm
     dtheta, dvel = accumulate(*sensed, every)
     seen = observe_attitude(star_key, world.epochs.dcm, world.noise.star_noise)
     report = {"rotation-vector": so3_log, "euler": euler_from_dcm}[star]
-    lift_off = SinsTotal(
-        *jax.tree.map(lambda leaf: leaf[0], motion.state), jnp.zeros(3), jnp.zeros(3)
-    )
+    pad = jax.tree.map(lambda leaf: leaf[0], motion.state)
+    lift_off = SinsTotal(pad.dcm, pad.velocity, pad.position, jnp.zeros(3), jnp.zeros(3))
     at_epochs = jnp.concatenate([bias[every::every], bias[-1:]])
     return Run(
         start=retract(lift_off, error0.at[LAYOUT.eps.start :].set(0)),
