@@ -31,6 +31,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxnav.estimation.banks.imm import imm as imm
+    from jaxnav.estimation.banks.imm import imm_params as imm_params
+    from jaxnav.estimation.banks.imm import uniform_switching as uniform_switching
     from jaxnav.estimation.banks.mixture import (
         BankParams as BankParams,
     )
@@ -42,9 +45,6 @@ if TYPE_CHECKING:
     )
     from jaxnav.estimation.banks.mixture import (
         mmae as mmae,
-    )
-    from jaxnav.estimation.banks.mixture import (
-        moment_match as moment_match,
     )
     from jaxnav.estimation.banks.mixture import (
         panel as panel,
@@ -74,7 +74,13 @@ if TYPE_CHECKING:
         windowed_reset as windowed_reset,
     )
     from jaxnav.estimation.bounds import oracle as oracle
+    from jaxnav.estimation.filters.kalman import ekf as ekf
     from jaxnav.estimation.filters.kalman import kf as kf
+    from jaxnav.estimation.filters.sigma_point import ckf as ckf
+    from jaxnav.estimation.filters.sigma_point import square_root_ckf as square_root_ckf
+    from jaxnav.estimation.filters.sigma_point import square_root_ukf as square_root_ukf
+    from jaxnav.estimation.filters.sigma_point import ukf as ukf
+    from jaxnav.estimation.filters.square_root import square_root_ekf as square_root_ekf
     from jaxnav.estimation.filters.square_root import square_root_kf as square_root_kf
     from jaxnav.estimation.montecarlo import RunOutput as RunOutput
     from jaxnav.estimation.montecarlo import monte_carlo as monte_carlo
@@ -115,12 +121,12 @@ if TYPE_CHECKING:
     )
 
 _HOMES = {
+    "jaxnav.estimation.banks.imm": ("imm", "imm_params", "uniform_switching"),
     "jaxnav.estimation.banks.mixture": (
         "BankParams",
         "bank",
         "immae",
         "mmae",
-        "moment_match",
         "panel",
     ),
     "jaxnav.estimation.banks.weights": (
@@ -134,8 +140,14 @@ _HOMES = {
         "windowed_reset",
     ),
     "jaxnav.estimation.bounds": ("oracle",),
-    "jaxnav.estimation.filters.kalman": ("kf",),
-    "jaxnav.estimation.filters.square_root": ("square_root_kf",),
+    "jaxnav.estimation.filters.kalman": ("ekf", "kf"),
+    "jaxnav.estimation.filters.sigma_point": (
+        "ckf",
+        "square_root_ckf",
+        "square_root_ukf",
+        "ukf",
+    ),
+    "jaxnav.estimation.filters.square_root": ("square_root_ekf", "square_root_kf"),
     "jaxnav.estimation.montecarlo": ("RunOutput", "monte_carlo"),
     "jaxnav.estimation.run": ("run", "simulate"),
     "jaxnav.estimation.tune": ("fit", "negative_log_likelihood"),

@@ -80,7 +80,7 @@ class MmaeUkfConfig:
     p0_position: float = 5.0
     p0_drift_deg_h: float = 0.5
     misalignment_deg: float = 20.0
-    settle_s: float = 60.0
+    settle_s: float = 10.0
     models: int = 10
     model_range: tuple[float, float] = (0.25, 4.0)
     reset_period_s: float = 10.0
