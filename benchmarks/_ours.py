@@ -68,7 +68,7 @@ def _study_run(bank: Filter, inputs_of: Callable[[Any, Array], Any]) -> Callable
 
     def run_one(key: Array, shared: Any) -> RunOutput:
         keys, z, source, params = shared
-        index = jnp.argmax(jnp.all(keys == jax.random.key_data(key)[None], axis=-1))
+        index = run_index(keys, key)
         observations = Obs(z[index], jnp.ones(z.shape[1:], bool))
         inputs = inputs_of(source, index)
         attitude = run(bank, params, inputs, observations, record=_attitude).record
@@ -96,6 +96,16 @@ def _study(
     run_one: Callable, z: Array, source: Any, params: Any, tile: int | None = None
 ) -> Callable[[], Statistics]:
     key, runs = jax.random.key(1), len(z)
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(runs, dtype=jnp.int32))
-    shared = (jax.random.key_data(keys), z, source, params)
+    shared = (run_keys(key, runs), z, source, params)
     return lambda: monte_carlo(run_one, key, runs, shared, tile=tile).rows
+
+
+def run_keys(key: Array, runs: int) -> Array:
+    """Return the data of the keys that ``monte_carlo`` gives to runs 0, 1, ..."""
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(runs, dtype=jnp.int32))
+    return jax.random.key_data(keys)
+
+
+def run_index(keys: Array, key: Array) -> Array:
+    """Return which of the :func:`run_keys` a run has, by which it finds data simulated before."""
+    return jnp.argmax(jnp.all(keys == jax.random.key_data(key)[None], axis=-1))

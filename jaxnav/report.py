@@ -14,6 +14,9 @@ from jaxnav.results import provenance, summary
 from jaxnav.studies import STUDIES
 from jaxnav.studies.base import Claim, StudyResult
 
+NOT_SHOWN = ("anees_dof", "log_likelihood_se")
+"""Measures of a method that the table leaves to ``summary.json``."""
+
 
 class Progress:
     """Progress of the scenarios with the time left, on standard error."""
@@ -85,11 +88,14 @@ def _method_table(result: StudyResult) -> Table:
     for measures in result.methods.values():
         for name, measure in measures.get("rmse", {}).items():
             columns[name] = measure["unit"]
-    scalars = [
-        name
-        for name in ("log_likelihood", "anees", "diverged")
-        if any(name in measures for measures in result.methods.values())
-    ]
+    scalars = list(
+        dict.fromkeys(
+            name
+            for measures in result.methods.values()
+            for name, value in measures.items()
+            if isinstance(value, int | float) and name not in NOT_SHOWN
+        )
+    )
     for name, unit in columns.items():
         table.add_column(escape(f"RMSE {name} [{unit}]"), justify="right")
     for name in scalars:

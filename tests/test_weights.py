@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.estimation.banks.imm import uniform_switching
 from jaxnav.estimation.banks.mixture import mixture_info, moment_match
 from jaxnav.estimation.banks.weights import (
     WindowedReset,
@@ -15,6 +16,8 @@ from jaxnav.estimation.banks.weights import (
     forget,
     markov,
     normalise,
+    switch,
+    switched,
     uniform,
     windowed_reset,
 )
@@ -27,6 +30,7 @@ RULES: dict[str, tuple[WeightRule, tuple]] = {
     "floor": (chain(bayes(), floor()), ((), jnp.array(1e-6))),
     "forget": (chain(forget(), bayes()), (jnp.array(0.98), ())),
     "markov": (chain(markov(), bayes()), (jnp.array(1e-3), ())),
+    "switch": (chain(switch(), bayes()), (uniform_switching(MODELS, 1e-3), ())),
     "reset": (chain(bayes(), windowed_reset()), ((), RESET)),
     "smooth reset": (chain(bayes(), windowed_reset(smooth=True)), ((), RESET)),
 }
@@ -79,13 +83,23 @@ def test_members_alike_keep_equal_weights(name: str) -> None:
     np.testing.assert_allclose(np.exp(weigh(name, rows)), 1 / MODELS, atol=1e-12)
 
 
+def leaking(transition: jax.Array) -> jax.Array:
+    """A transition matrix with two models more, to which every model goes and that go to all."""
+    to_padding = jnp.full((MODELS, 2), 0.05)
+    from_padding = jnp.full((2, MODELS + 2), 1 / (MODELS + 2))
+    return jnp.concatenate(
+        [jnp.concatenate([0.9 * transition, to_padding], axis=1), from_padding], axis=0
+    )
+
+
 @each_rule
 def test_padding_changes_nothing_and_stays_out(name: str) -> None:
     rng = np.random.default_rng(1)
     rows = jnp.array(rng.normal(size=(300, MODELS)))
     padded = jnp.concatenate([rows, 100 + rows[:, :2]], axis=1)
     prior = jnp.array([0.0, 0.0, 0.0, -jnp.inf, -jnp.inf])
-    plain, wide = weigh(name, rows), weigh(name, padded, prior)
+    params = (leaking(RULES[name][1][0]), ()) if name == "switch" else None
+    plain, wide = weigh(name, rows), weigh(name, padded, prior, params)
     np.testing.assert_allclose(wide[:, :MODELS], plain, atol=1e-12)
     assert np.all(np.isneginf(wide[:, MODELS:]))
 
@@ -100,7 +114,7 @@ def test_veto_of_all_keeps_weights_and_of_one_drops_it(name: str, veto: float) -
     np.testing.assert_allclose(dropped[2:, [0, 2]], 0.5, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["floor", "markov", "reset"])
+@pytest.mark.parametrize("name", ["floor", "markov", "switch", "reset"])
 def test_a_model_that_was_ruled_out_comes_back(name: str) -> None:
     """After 2000 steps against it, a model that turns right leads within two windows."""
     wrong = jnp.broadcast_to(jnp.array([0.0, -2.0, -8.0]), (2000, MODELS))
@@ -135,6 +149,29 @@ def test_gradient_of_a_rules_parameter(name: str) -> None:
         h = 1e-5 * value
         ahead, behind = score(values.at[i].add(h)), score(values.at[i].add(-h))
         np.testing.assert_allclose(gradient[i], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-7)
+
+
+def test_switched_is_the_dense_product() -> None:
+    """With an impossible move, a model that nothing goes to and one that takes no part."""
+    Pi = np.array(
+        [[0.7, 0.0, 0.0, 0.3], [0.2, 0.0, 0.5, 0.3], [0.6, 0.0, 0.4, 0.0], [0.25, 0.25, 0.25, 0.25]]
+    )
+    w = np.array([0.5, 0.3, 0.2, 0.0])
+    with np.errstate(divide="ignore"):
+        log_weights = jnp.array(np.log(w))
+    after, origins = (np.exp(np.asarray(part)) for part in switched(log_weights, jnp.array(Pi)))
+    kept = Pi * (np.arange(4) < 3)
+    expected = w @ kept
+    np.testing.assert_allclose(after, expected / expected.sum(), rtol=1e-14)
+    for j in (0, 2):
+        np.testing.assert_allclose(origins[:, j], w * Pi[:, j] / expected[j], rtol=1e-14)
+    for j in (1, 3):
+        np.testing.assert_array_equal(origins[:, j], np.eye(4)[j])
+
+
+def test_switch_of_equal_probabilities_is_markov() -> None:
+    rows = jnp.array(np.random.default_rng(6).normal(size=(300, MODELS)))
+    np.testing.assert_allclose(weigh("switch", rows), weigh("markov", rows), rtol=1e-12)
 
 
 def test_fixed_weights_do_not_move() -> None:

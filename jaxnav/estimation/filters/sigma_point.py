@@ -228,6 +228,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         return Gaussian(state.x, state.P)
 
     def restart(state: SigmaPointState, given: Gaussian) -> SigmaPointState:
+        # Points that were kept stay until the next prediction makes them anew.
         return SigmaPointState(given.mean, given.cov, state.points, state.indefinite)
 
     return Filter(init, predict, update, estimate, restart, model.retract, model.local)
