@@ -75,7 +75,7 @@ def _draw_weights(result: StudyResult, path: Path) -> None:
             axes.minorticks_off()
             axes.grid(visible=False)
             drawing.colorbar(image, ax=axes, label="mean weight")
-        grid[0].legend(loc="upper left")
+        grid[0].legend(loc="lower right")
         grid[-1].set_xlabel("time [s]")
         drawing.suptitle(f"{result.scenario}: weights of the models, mean of {result.runs} runs")
 
