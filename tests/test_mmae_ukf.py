@@ -65,10 +65,16 @@ def test_models_are_hammersley_points_in_log_space() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "thirds"), [("paper", (0.25, 1.0, 4.0)), ("reversed", (4.0, 1.0, 0.25))]
+    ("config", "thirds"),
+    [
+        (MmaeUkfConfig(scenario="paper", duration_s=3.0), (0.25, 1.0, 4.0)),
+        (MmaeUkfConfig(scenario="reversed", duration_s=3.0), (4.0, 1.0, 0.25)),
+    ],
 )
-def test_true_noise_changes_in_thirds(scenario: str, thirds: tuple[float, ...]) -> None:
-    world = build_world(MmaeUkfConfig(scenario=scenario, duration_s=3.0))
+def test_true_noise_changes_in_thirds(
+    config: MmaeUkfConfig, thirds: tuple[float, float, float]
+) -> None:
+    world = build_world(config)
     np.testing.assert_array_equal(world.step_scale, np.repeat(thirds, 20))
     np.testing.assert_array_equal(world.sample_scale, np.repeat(thirds, 100))
 

@@ -40,7 +40,7 @@ STUDIES = {
         entry="jaxnav.studies.immae.study:run_study",
         figures="jaxnav.studies.immae.figures:draw",
         scenarios="jaxnav.studies.immae.config:SCENARIOS",
-        check="jaxnav.studies.immae.study:check",
+        check="jaxnav.studies.base:check_simulated",
     ),
     "mmae-ukf": Study(
         summary="banks of EKF and UKF on a 300 s boost, total-state SINS/CNS (Zhao, Chen, He, Ge)",
@@ -48,7 +48,7 @@ STUDIES = {
         entry="jaxnav.studies.mmae_ukf.study:run_study",
         figures="jaxnav.studies.mmae_ukf.figures:draw",
         scenarios="jaxnav.studies.mmae_ukf.config:SCENARIOS",
-        check="jaxnav.studies.mmae_ukf.study:check",
+        check="jaxnav.studies.base:check_simulated",
     ),
     "gnss-track": Study(
         summary="a recorded GNSS track through the same bank, judged by predictive likelihood",

@@ -1,10 +1,13 @@
 """What studies of attitude share: axes, the measures of a method, when a run is lost."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
-from jaxnav.estimation.metrics import rmse
+from jaxnav.estimation.metrics import rmse, trmse
+from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.units import ARCSEC
 
 AXES = ("yaw", "pitch", "roll")
@@ -37,3 +40,43 @@ def attitude_measures(
         "anees_dof": 3,
         "diverged": int(lost.sum()),
     }
+
+
+def attitude_arrays(
+    campaign: Campaign, period: float, methods: Sequence[str], banks: Sequence[str]
+) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
+    """Return the arrays of a study of attitude and the names of their axes.
+
+    Args:
+        campaign: Rows with ``mean_square`` and ``nees``, curves with ``square`` and ``weights``,
+            traces with ``error``, ``sigma`` and ``weights``.
+        period: Filter period [s].
+        methods: Names along the axis of methods.
+        banks: Names along the axis of banks.
+    """
+    curve, first = campaign.mean_curve, jax.tree.map(lambda leaf: leaf[0], campaign.traces)
+    steps = curve["square"].shape[0]
+    arrays = {
+        "time": period * np.arange(1, steps + 1),
+        "trmse": trmse(curve["square"]) / ARCSEC,
+        "mean_weights": curve["weights"],
+        "run_0_error": first["error"] / ARCSEC,
+        "run_0_sigma": first["sigma"] / ARCSEC,
+        "run_0_weights": first["weights"],
+        "mean_square": campaign.rows.mean_square / ARCSEC**2,
+        "nees": campaign.rows.nees,
+        "estimator": np.array(methods),
+        "axis": np.array(AXES),
+        "bank": np.array(banks),
+    }
+    dims = {
+        "time": ("time",),
+        "trmse": ("time", "estimator", "axis"),
+        "mean_weights": ("time", "bank", "model"),
+        "run_0_error": ("time", "estimator", "axis"),
+        "run_0_sigma": ("time", "estimator", "component"),
+        "run_0_weights": ("time", "bank", "model"),
+        "mean_square": ("run", "estimator", "axis"),
+        "nees": ("run", "estimator"),
+    }
+    return arrays, dims

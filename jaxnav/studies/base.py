@@ -1,7 +1,10 @@
 """What every study is: scenarios of a configuration, a result, claims and their verdicts."""
 
 import math
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from types import NoneType, UnionType
 from typing import Any, get_args
 
 
@@ -16,11 +19,17 @@ def require(condition: bool, name: str, value: object, accepted: str) -> None:
 
 
 def require_choice(config: Any, *names: str) -> None:
-    """Require that fields annotated as literals hold one of them."""
+    """Require that fields annotated as literals, or as literals or ``None``, hold one of them."""
     for name in names:
-        accepted = get_args(type(config).__annotations__[name])
+        annotation = type(config).__annotations__[name]
+        optional = isinstance(annotation, UnionType)
+        literals = (
+            next(a for a in get_args(annotation) if a is not NoneType) if optional else annotation
+        )
+        accepted = get_args(literals)
         value = getattr(config, name)
-        require(value in accepted, name, value, "one of " + ", ".join(accepted))
+        good = value in accepted or (optional and value is None)
+        require(good, name, value, "one of " + ", ".join(accepted))
 
 
 def require_positive(config: Any, *names: str) -> None:
@@ -107,6 +116,40 @@ def require_x64() -> None:
         False,
         "True before a study runs (jax.config.update('jax_enable_x64', True) or JAX_ENABLE_X64=1)",
     )
+
+
+def check_simulated(config: Any) -> None:
+    """Raise :class:`ConfigError` if a simulated study cannot run here, whatever its values."""
+    del config
+    require_x64()
+
+
+def run_scenarios(
+    config: Any,
+    scenarios: Iterable[str],
+    run_scenario: "Callable[[Any, Callable[[int, int], None] | None], StudyResult]",
+    progress: Callable[[str, int, int], None] | None,
+) -> "list[StudyResult]":
+    """Run one scenario of a simulated study, or all of them.
+
+    Args:
+        config: The configuration; its ``scenario`` is one of them or "all".
+        scenarios: Their names, in order.
+        run_scenario: Takes the configuration of one scenario and what to call with (runs done,
+            runs), if anything.
+        progress: Called with (scenario, runs done, runs).
+
+    Raises:
+        ConfigError: If 64-bit floats are off.
+    """
+    check_simulated(config)
+    names = tuple(scenarios) if config.scenario == "all" else (config.scenario,)
+    return [
+        run_scenario(
+            replace(config, scenario=name), None if progress is None else partial(progress, name)
+        )
+        for name in names
+    ]
 
 
 @dataclass(frozen=True)

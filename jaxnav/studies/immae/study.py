@@ -1,16 +1,14 @@
 """The study as a whole: scenarios, Monte Carlo, measures."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxnav.estimation.metrics import trmse
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
-from jaxnav.studies.attitude import AXES, attitude_measures
-from jaxnav.studies.base import StudyResult, plain, require_x64
+from jaxnav.studies.attitude import attitude_arrays, attitude_measures
+from jaxnav.studies.base import StudyResult, plain, run_scenarios
 from jaxnav.studies.immae.claims import PUBLISHED, assess
 from jaxnav.studies.immae.config import SCENARIOS, ImmaeConfig
 from jaxnav.studies.immae.methods import (
@@ -39,27 +37,12 @@ def run_study(
     Raises:
         ConfigError: If 64-bit floats are off.
     """
-    check(config)
-    names = tuple(SCENARIOS) if config.scenario == "all" else (config.scenario,)
-    return [_run_scenario(replace(config, scenario=name), progress) for name in names]
+    return run_scenarios(config, SCENARIOS, _run_scenario, progress)
 
 
-def check(config: ImmaeConfig) -> None:
-    """Raise :class:`ConfigError` if the study cannot run here; the configuration checks itself."""
-    del config
-    require_x64()
-
-
-def _run_scenario(
-    config: ImmaeConfig, progress: Callable[[str, int, int], None] | None
-) -> StudyResult:
-    campaign = run_campaign(
-        config,
-        keep=1,
-        progress=None
-        if progress is None
-        else lambda done, total: progress(config.scenario, done, total),
-    )
+def _run_scenario(config: ImmaeConfig, progress: Callable[[int, int], None] | None) -> StudyResult:
+    campaign = run_campaign(config, keep=1, progress=progress)
+    arrays, dims = attitude_arrays(campaign, config.filter_period_s, METHODS, BANKS)
     return StudyResult(
         study="immae",
         scenario=config.scenario,
@@ -69,17 +52,8 @@ def _run_scenario(
         methods=_measures(config, campaign),
         published=PUBLISHED.get(config.scenario, {}),
         claims=assess(config, campaign),
-        arrays=_arrays(config, campaign),
-        dims={
-            "time": ("time",),
-            "trmse": ("time", "estimator", "axis"),
-            "mean_weights": ("time", "bank", "model"),
-            "run_0_error": ("time", "estimator", "axis"),
-            "run_0_sigma": ("time", "estimator", "component"),
-            "run_0_weights": ("time", "bank", "model"),
-            "mean_square": ("run", "estimator", "axis"),
-            "nees": ("run", "estimator"),
-        },
+        arrays={**arrays, "model": np.array(config.theta)},
+        dims=dims,
     )
 
 
@@ -100,22 +74,4 @@ def _measures(config: ImmaeConfig, campaign: Campaign) -> dict[str, dict[str, An
             config.star_noise_arcsec * ARCSEC,
         )
         for i, name in enumerate(METHODS)
-    }
-
-
-def _arrays(config: ImmaeConfig, campaign: Campaign) -> dict[str, Any]:
-    curve, first = campaign.mean_curve, jax.tree.map(lambda leaf: leaf[0], campaign.traces)
-    return {
-        "time": config.filter_period_s * np.arange(1, config.steps + 1),
-        "trmse": trmse(curve["square"]) / ARCSEC,
-        "mean_weights": curve["weights"],
-        "run_0_error": first["error"] / ARCSEC,
-        "run_0_sigma": first["sigma"] / ARCSEC,
-        "run_0_weights": first["weights"],
-        "mean_square": campaign.rows.mean_square / ARCSEC**2,
-        "nees": campaign.rows.nees,
-        "estimator": np.array(METHODS),
-        "axis": np.array(AXES),
-        "bank": np.array(BANKS),
-        "model": np.array(config.theta),
     }

@@ -97,9 +97,7 @@ class MmaeUkfConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "scenario")
-        if self.star is not None:
-            require_choice(self, "star")
+        require_choice(self, "scenario", "star")
         require_finite(self)
         require_runs(self)
         require_positive(self, *_POSITIVE)

@@ -1,16 +1,14 @@
 """The study as a whole: scenarios, Monte Carlo, measures."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxnav.estimation.metrics import trmse
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
-from jaxnav.studies.attitude import AXES, attitude_measures
-from jaxnav.studies.base import StudyResult, plain, require_x64
+from jaxnav.studies.attitude import attitude_arrays, attitude_measures
+from jaxnav.studies.base import StudyResult, plain, run_scenarios
 from jaxnav.studies.mmae_ukf import cost, sweep
 from jaxnav.studies.mmae_ukf.claims import assess, discrepancies, gain
 from jaxnav.studies.mmae_ukf.config import SCENARIOS, MmaeUkfConfig
@@ -44,15 +42,7 @@ def run_study(
     Raises:
         ConfigError: If 64-bit floats are off.
     """
-    check(config)
-    names = tuple(SCENARIOS) if config.scenario == "all" else (config.scenario,)
-    return [_run_scenario(replace(config, scenario=name), progress) for name in names]
-
-
-def check(config: MmaeUkfConfig) -> None:
-    """Raise :class:`ConfigError` if the study cannot run here; the configuration checks itself."""
-    del config
-    require_x64()
+    return run_scenarios(config, SCENARIOS, _run_scenario, progress)
 
 
 def run_campaign(config: MmaeUkfConfig, **options: Any) -> Campaign:
@@ -63,15 +53,9 @@ def run_campaign(config: MmaeUkfConfig, **options: Any) -> Campaign:
 
 
 def _run_scenario(
-    config: MmaeUkfConfig, progress: Callable[[str, int, int], None] | None
+    config: MmaeUkfConfig, progress: Callable[[int, int], None] | None
 ) -> StudyResult:
-    campaign = run_campaign(
-        config,
-        keep=1,
-        progress=None
-        if progress is None
-        else lambda done, total: progress(config.scenario, done, total),
-    )
+    campaign = run_campaign(config, keep=1, progress=progress)
     costs = cost.step_costs(config) if config.cost else None
     arrays, dims = _arrays(config, campaign)
     if config.scenario == "large-misalignment":
@@ -130,8 +114,8 @@ def _notes(config: MmaeUkfConfig, campaign: Campaign) -> list[str]:
     if config.scenario == "large-misalignment":
         notes.append(
             f"RMSE from {config.settle_s:g} s on, star tracker as {config.star_form}; "
-            f"settled_quickly is the share of runs within the band from {QUICKLY_S:g} s on. The oracle "
-            "knows the noise, not how far off it starts: it is no bound here."
+            f"settled_quickly is the share of runs within the band from {QUICKLY_S:g} s on. "
+            "The oracle knows the noise, not how far off it starts: it is no bound here."
         )
     return notes
 
@@ -139,35 +123,16 @@ def _notes(config: MmaeUkfConfig, campaign: Campaign) -> list[str]:
 def _arrays(
     config: MmaeUkfConfig, campaign: Campaign
 ) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
-    curve, first = campaign.mean_curve, jax.tree.map(lambda leaf: leaf[0], campaign.traces)
+    arrays, dims = attitude_arrays(campaign, config.filter_period_s, METHODS, BANKS)
     regular, uniform = discrepancies(config.seed)
-    arrays = {
-        "time": config.filter_period_s * np.arange(1, config.steps + 1),
-        "trmse": trmse(curve["square"]) / ARCSEC,
-        "mean_weights": curve["weights"],
-        "run_0_error": first["error"] / ARCSEC,
-        "run_0_sigma": first["sigma"] / ARCSEC,
-        "run_0_weights": first["weights"],
-        "mean_square": campaign.rows.mean_square / ARCSEC**2,
-        "nees": campaign.rows.nees,
+    arrays |= {
         "settled": config.filter_period_s * campaign.rows.settled,
         "model_factors": model_factors(config),
         "true_factor": np.sqrt(np.asarray(build_world(config).step_scale)),
         "hammersley_discrepancy": np.array([regular]),
         "uniform_discrepancy": uniform,
-        "estimator": np.array(METHODS),
-        "axis": np.array(AXES),
-        "bank": np.array(BANKS),
     }
-    dims = {
-        "time": ("time",),
-        "trmse": ("time", "estimator", "axis"),
-        "mean_weights": ("time", "bank", "model"),
-        "run_0_error": ("time", "estimator", "axis"),
-        "run_0_sigma": ("time", "estimator", "component"),
-        "run_0_weights": ("time", "bank", "model"),
-        "mean_square": ("run", "estimator", "axis"),
-        "nees": ("run", "estimator"),
+    dims |= {
         "settled": ("run", "estimator"),
         "model_factors": ("model", "parameter"),
         "true_factor": ("time",),
