@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from types import NoneType, UnionType
+from types import NoneType
 from typing import Any, get_args
 
 
@@ -21,12 +21,9 @@ def require(condition: bool, name: str, value: object, accepted: str) -> None:
 def require_choice(config: Any, *names: str) -> None:
     """Require that fields annotated as literals, or as literals or ``None``, hold one of them."""
     for name in names:
-        annotation = type(config).__annotations__[name]
-        optional = isinstance(annotation, UnionType)
-        literals = (
-            next(a for a in get_args(annotation) if a is not NoneType) if optional else annotation
-        )
-        accepted = get_args(literals)
+        parts = get_args(type(config).__annotations__[name])
+        optional = NoneType in parts
+        accepted = get_args(parts[0]) if optional else parts
         value = getattr(config, name)
         good = value in accepted or (optional and value is None)
         require(good, name, value, "one of " + ", ".join(accepted))
