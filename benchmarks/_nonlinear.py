@@ -27,7 +27,7 @@ ALPHA, BETA, KAPPA = 1.0, 2.0, 0.0
 """The unscented rule of all contestants."""
 
 Answer = tuple[Any, Any]
-"""Means ``(runs, T, 15)`` and log-likelihoods ``(runs,)``."""
+"""Means ``(runs, T, 15)`` and log-likelihoods ``(runs,)``, or ``(runs, T)`` of the steps."""
 Calls = dict[str, Callable[[], Answer]]
 
 
@@ -287,8 +287,9 @@ def smcx_series(rule: str) -> Callable[[Nonlinear], Callable[[Array], Answer]]:
                 F, slope = jax.jacfwd(f), jax.jacfwd(h)
                 out = smcx.extended_kalman_filter(x, P, f, F, Q, h, slope, R, z)
             else:
-                numbers = {"alpha": ALPHA, "beta": BETA, "kappa": KAPPA}
-                out = smcx.unscented_kalman_filter(x, P, f, Q, h, R, z, **numbers)
+                out = smcx.unscented_kalman_filter(
+                    x, P, f, Q, h, R, z, alpha=ALPHA, beta=BETA, kappa=KAPPA
+                )
             return out.filtered_means, out.marginal_loglik
 
         return filter_one
@@ -380,7 +381,5 @@ PEERS = (
     Peer("dynamax", "ukf", "ukf", 16_000, jax_calls(dynamax_series("ukf"))),
     Peer("smcx", "ukf", "ukf", 16_000, jax_calls(smcx_series("ukf"))),
     Peer("filterpy, one run", "ukf", "ukf", 200, filterpy_calls("ukf"), runs=1),
-    Peer(
-        "filterpy, one run", "ckf, redraw=False", "ckf-kept", 200, filterpy_calls("ckf"), runs=1
-    ),
+    Peer("filterpy, one run", "ckf, redraw=False", "ckf-kept", 200, filterpy_calls("ckf"), runs=1),
 )

@@ -405,7 +405,7 @@ RULES = Rules(
 
 
 def fifteen_states(build: Callable[[Model], Filter], dtype: jnp.dtype) -> tuple[np.ndarray, ...]:
-    """Covariances, their least correlation eigenvalues and flags of a run with each of the rules."""
+    """Covariances, least eigenvalues of the correlations and flags of a run with each rule."""
     rng = np.random.default_rng(0)
     mixing, H = rng.normal(size=(15, 15)) / np.sqrt(15), rng.normal(size=(3, 15))
     A, seen, gain = (jnp.asarray(value, dtype) for value in (mixing, H, 0.1))

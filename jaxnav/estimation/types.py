@@ -101,7 +101,8 @@ class Model(NamedTuple):
 
     Write ``transition`` with multiply-adds over blocks (:func:`~jaxnav.numerics.linalg.matmul`)
     rather than as one dense product: the linear filters never form the transition matrix, they push
-    the columns of the covariance through this function, so its structure is what they pay for.
+    the columns of the covariance through this function, so its structure is what they pay for. Of a
+    nonlinear model the same holds for ``jacobians``.
 
     Attributes:
         transition: ``(params, x, u) -> x`` over one step; ``u`` holds the inputs of the step.

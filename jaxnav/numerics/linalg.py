@@ -5,7 +5,8 @@ whole Kalman step, so the sizes a navigation filter meets (three axes, up to six
 written out as multiply-adds over Python loops that unroll at trace time.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -165,36 +166,57 @@ def semidefinite_root(A: Array) -> SemidefiniteRoot:
     diagonal = jnp.diag(A)
     sound = jnp.all(diagonal >= 0)
     rounding = 2 * n * jnp.finfo(A.dtype).eps
-    rest = A + rounding * jnp.diag(diagonal)
 
     def eliminate(rest: Array) -> tuple[Array, tuple[Array, Array]]:
         pivot = rest[0, 0]
         good = pivot > 0
         column = rest[:, 0] * jnp.where(good, 1 / jnp.sqrt(jnp.where(good, pivot, 1)), 0)
-        return rest - column[:, None] * column[None], (pivot, column)
+        return (rest - column[:, None] * column[None])[1:, 1:], (pivot, column)
 
-    # The pivot moves to the corner, where reading it costs no gather. Beyond a few columns a loop
-    # is as fast as its unrolled form, and a third of the program to compile.
+    pivots, columns = _by_columns(eliminate, A + rounding * jnp.diag(diagonal))
+    lowest = jnp.min(jnp.stack(pivots) / jnp.where(diagonal > 0, diagonal, 1))
+    factor = jnp.where(sound, _lower(columns), jnp.nan)
+    return SemidefiniteRoot(factor, sound & (lowest >= -8 * rounding))
+
+
+def _by_columns(
+    step: Callable[[Any], tuple[Any, tuple[Array, Array]]], rest: Any
+) -> tuple[list[Array], list[Array]]:
+    """Take a square matrix apart column by column, the pivot always in the corner.
+
+    Reading the pivot there costs no gather. Beyond a few columns a loop is as fast as its unrolled
+    form, and a fraction of the program to compile.
+
+    Args:
+        step: From what is left to what is left after a column, one row and column smaller, with a
+            number about the pivot and the column from the pivot down.
+        rest: What is left at the start; a pytree whose leaves are ``(n, n)`` or ``(n,)``.
+
+    Returns:
+        The numbers and the columns, of lengths n, n - 1, ..., 1.
+    """
+    n = jax.tree.leaves(rest)[0].shape[0]
     if n <= UNROLL_LIMIT:
-        done: list[tuple[Array, Array]] = []
+        numbers, columns = [], []
         for _ in range(n):
-            rest, one = eliminate(rest)
-            rest = rest[1:, 1:]
-            done.append(one)
-        pivots = jnp.stack([pivot for pivot, _ in done])
-        columns = [column for _, column in done]
-    else:
+            rest, (number, column) = step(rest)
+            numbers.append(number)
+            columns.append(column)
+        return numbers, columns
 
-        def shifted(rest: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            rest, one = eliminate(rest)
-            return jnp.pad(rest[1:, 1:], ((0, 1), (0, 1))), one
+    def padded(rest: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
+        rest, found = step(rest)
+        return jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, 1),) * leaf.ndim), rest), found
 
-        pivots, stacked = jax.lax.scan(shifted, rest, None, length=n)[1]
-        columns = [stacked[j, : n - j] for j in range(n)]
-    zeros = [jnp.zeros(j, A.dtype) for j in range(n)]
-    factor = jnp.stack([jnp.concatenate(pair) for pair in zip(zeros, columns, strict=True)], axis=1)
-    lowest = jnp.min(pivots / jnp.where(diagonal > 0, diagonal, 1))
-    return SemidefiniteRoot(jnp.where(sound, factor, jnp.nan), sound & (lowest >= -8 * rounding))
+    numbers, columns = jax.lax.scan(padded, rest, None, length=n)[1]
+    return list(numbers), [columns[j, : n - j] for j in range(n)]
+
+
+def _lower(columns: list[Array]) -> Array:
+    """Return the lower-triangular matrix of columns that start at the diagonal."""
+    n = len(columns)
+    zeros = [jnp.zeros(n - column.shape[0], column.dtype) for column in columns]
+    return jnp.stack([jnp.concatenate(pair) for pair in zip(zeros, columns, strict=True)], axis=1)
 
 
 def downdate(L: Array, v: Array) -> SemidefiniteRoot:
@@ -209,21 +231,20 @@ def downdate(L: Array, v: Array) -> SemidefiniteRoot:
     References:
         Bojanczyk, Brent, van Dooren, de Hoog (1987), SIAM J. Sci. Stat. Comput. 8(3).
     """
-    n = L.shape[0]
-    rest, tail = L, v
-    sound = jnp.array(True)
-    columns: list[Array] = []
-    for j in range(n):
+
+    def rotate(left: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        rest, tail = left
         pivot, lead = rest[0, 0], tail[0]
         squared = (pivot - lead) * (pivot + lead)
         good = (squared > 0) & (pivot > 0)
-        sound = sound & (good | ((pivot == 0) & (lead == 0)))
         root = jnp.sqrt(jnp.where(good, squared, 1))
         safe = jnp.where(good, pivot, 1)
         cosine, sine = root / safe, jnp.where(good, lead / safe, 0)
         column = (rest[1:, 0] - sine * tail[1:]) / cosine
         tail = cosine * tail[1:] - sine * column
-        head = jnp.where(good, root, 0)[None]
-        columns.append(jnp.concatenate([jnp.zeros(j, L.dtype), head, column]))
-        rest = rest[1:, 1:]
-    return SemidefiniteRoot(jnp.where(sound, jnp.stack(columns, axis=1), L), sound)
+        whole = jnp.concatenate([jnp.where(good, root, 0)[None], column])
+        return (rest[1:, 1:], tail), (good | ((pivot == 0) & (lead == 0)), whole)
+
+    done, columns = _by_columns(rotate, (L, v))
+    sound = jnp.all(jnp.stack(done))
+    return SemidefiniteRoot(jnp.where(sound, _lower(columns), L), sound)

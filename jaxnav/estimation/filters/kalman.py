@@ -1,8 +1,8 @@
 """The Kalman filter and the extended Kalman filter in Joseph form: one body.
 
-The covariance recursion never forms the transition or the observation matrix: both are applied to
-the columns of the covariance as linear functions. A model that is written in blocks therefore costs
-what its blocks cost, and for a linear model nothing in the recursion depends on the data, so that
+For a linear model the covariance recursion never forms the transition or the observation matrix:
+both are applied to the columns of the covariance as functions. A model that is written in blocks
+therefore costs what its blocks cost, and nothing in the recursion depends on the data, so that
 ``vmap`` over runs computes one covariance for all of them.
 """
 
@@ -21,8 +21,8 @@ from jaxnav.estimation.filters.innovation import (
 )
 from jaxnav.estimation.filters.linearise import (
     observation_map,
-    require_vector_space,
     transition_map,
+    with_itself_as_jacobians,
 )
 from jaxnav.estimation.types import (
     Filter,
@@ -74,8 +74,7 @@ def kf(model: Model) -> Filter:
         Si, Wang, Niu, "High precision attitude estimation algorithm for SINS/CNS integrated
         navigation with unknown noise characteristics", Eqs. (7)-(13); Bucy and Joseph (1968).
     """
-    require_vector_space(model)
-    return ekf(model)
+    return ekf(with_itself_as_jacobians(model))
 
 
 def ekf(model: Model) -> Filter:

@@ -1,8 +1,10 @@
 """A model's functions as linear maps of tangent vectors: automatic, or as the model gives them.
 
-Neither the transition nor the observation matrix is formed: the maps are applied to the columns of
-a covariance or of its root, so that a model written in blocks costs what its blocks cost. For a
-linear model the maps do not depend on the point, and ``vmap`` over runs shares what they make.
+A map is applied to the columns of a covariance or of its root. One that the model gives as a
+function costs what its blocks cost; an automatic one is formed as a matrix once and then multiplied
+with, since the derivative of a nonlinear function costs more than the product. A linear model is
+its own derivative (:func:`with_itself_as_jacobians`): its maps do not depend on the point, and
+``vmap`` over runs shares what they make.
 """
 
 from collections.abc import Callable
@@ -29,7 +31,7 @@ def transition_map(
     def moved(dx: Array) -> Array:
         return model.local(y, model.transition(params, model.retract(x, dx), u))
 
-    return y, _derivative(moved, n)
+    return y, _derivative(moved, x, n)
 
 
 def observation_map(
@@ -43,7 +45,30 @@ def observation_map(
     def seen(dx: Array) -> Array:
         return model.residual(model.observe(params, model.retract(x, dx), u), z)
 
-    return z, _derivative(seen, n)
+    return z, _derivative(seen, x, n)
+
+
+def with_itself_as_jacobians(model: Model) -> Model:
+    """Return a linear model whose Jacobians are its own functions, free of matrices.
+
+    Raises:
+        ValueError: If the model has slots that a linear filter does not use.
+    """
+    unused = ("retract", "local", "jacobians")
+    own = [name for name in unused if getattr(model, name) is not Model._field_defaults[name]]
+    if own:
+        raise ValueError(
+            f"the model has its own {', '.join(own)}; a linear filter takes models with a vector "
+            "as state and no Jacobians, the ekf takes all"
+        )
+
+    def jacobians(params: Params, x: Array, u: Input) -> tuple[LinearMap, LinearMap]:
+        return (
+            lambda dx: jax.jvp(lambda x: model.transition(params, x, u), (x,), (dx,))[1],
+            lambda dx: jax.jvp(lambda x: model.observe(params, x, u), (x,), (dx,))[1],
+        )
+
+    return model._replace(jacobians=jacobians)
 
 
 def jacobians(model: Model, params: Params, x: Point, u: Input, n: int) -> tuple[Array, Array]:
@@ -64,29 +89,10 @@ def jacobians(model: Model, params: Params, x: Point, u: Input, n: int) -> tuple
     )
 
 
-def require_vector_space(model: Model) -> None:
-    """Raise ``ValueError`` if a model has slots that the linear filters do not use."""
-    unused = ("retract", "local", "jacobians")
-    own = [name for name in unused if getattr(model, name) is not Model._field_defaults[name]]
-    if own:
-        raise ValueError(
-            f"the model has its own {', '.join(own)}; a linear filter takes models with a vector "
-            "as state and no Jacobians, the ekf takes all"
-        )
-
-
-def _derivative(function: Callable[[Array], Array], n: int) -> ColumnMap:
-    """Return the derivative at zero of a function of a tangent vector ``(n,)``."""
-
-    def push(columns: Array) -> Array:
-        zero = jnp.zeros(n, columns.dtype)
-
-        def along(column: Array) -> Array:
-            return jax.jvp(function, (zero,), (column,))[1]
-
-        return jax.vmap(along, in_axes=1, out_axes=1)(columns)
-
-    return push
+def _derivative(function: Callable[[Array], Array], x: Point, n: int) -> ColumnMap:
+    """Return the derivative at zero of a function of a tangent vector ``(n,)`` at ``x``."""
+    zero = jnp.zeros(n, jax.tree.leaves(x)[0].dtype)
+    return _columns(jax.jacfwd(function)(zero))
 
 
 def _columns(jacobian: LinearMap) -> ColumnMap:

@@ -251,7 +251,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         require_step(model, state.x, x, Q)
         points, centre = _weighted(rule, cloud)
         L = tria(jnp.concatenate([points, centre.above, semidefinite_root(Q).factor], axis=1))
-        L, sound = _without(L, centre)
+        L, sound = _without(rule, L, centre)
         return SquareRootSigmaPointState(x, L, ~sound)
 
     def update(
@@ -268,7 +268,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         m = R.shape[0]
         points, centre = _weighted(rule, joint)
         columns = jnp.concatenate([points, centre.above], axis=1)
-        triangle, sound = _without(tria(update_array(R, columns[:m], columns[m:])), centre)
+        triangle, sound = _without(rule, tria(update_array(R, columns[:m], columns[m:])), centre)
         done = read_array(triangle, m, state.L)
         x = model.retract(state.x, done.gain @ solve_lower(done.root.factor, nu))
         indefinite = state.indefinite | ~sound
@@ -359,6 +359,8 @@ def _weighted(rule: SigmaRule, cloud: Cloud) -> tuple[Array, _CentreColumn]:
     return rule.weight**0.5 * cloud.offsets.T, _CentreColumn(above, below)
 
 
-def _without(L: Array, centre: _CentreColumn) -> tuple[Array, Array]:
+def _without(rule: SigmaRule, L: Array, centre: _CentreColumn) -> tuple[Array, Array]:
     """Take a negative centre away from a root; return it and whether that could be done."""
+    if not isinstance(rule.centre, Array) and rule.centre >= 0:
+        return L, jnp.array(True)
     return downdate(L, centre.below[:, 0])

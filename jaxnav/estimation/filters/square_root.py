@@ -14,8 +14,8 @@ from jaxnav.estimation.filters.innovation import (
 )
 from jaxnav.estimation.filters.linearise import (
     observation_map,
-    require_vector_space,
     transition_map,
+    with_itself_as_jacobians,
 )
 from jaxnav.estimation.types import (
     Filter,
@@ -73,8 +73,7 @@ def square_root_kf(model: Model) -> Filter:
     References:
         Kailath, Sayed, Hassibi (2000), Linear Estimation, section 12.3.
     """
-    require_vector_space(model)
-    return square_root_ekf(model)
+    return square_root_ekf(with_itself_as_jacobians(model))
 
 
 def square_root_ekf(model: Model) -> Filter:
