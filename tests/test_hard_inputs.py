@@ -41,8 +41,8 @@ BUILDERS = {
 COVARIANCE_FORMS = ("kf", "ekf", "ukf", "ckf")
 RUNS = ("kf", "square_root_kf", "ukf", "square_root_ckf")
 each_filter = pytest.mark.parametrize("name", BUILDERS)
-# a run costs seconds to compile; of a vector space the extended filters are the linear ones, and
-# the unscented rule differs from the cubature rule by one more point
+# a run costs seconds to compile: one of each form; of a linear model the extended filters differ
+# from the linear ones in how they apply its maps, and the two rules in the weight of the centre
 each_run = pytest.mark.parametrize("name", RUNS)
 UNSOUND = Flag.ILL_CONDITIONED | Flag.NOT_POSITIVE_DEFINITE | Flag.INDEFINITE
 

@@ -235,14 +235,14 @@ def downdate(L: Array, v: Array) -> SemidefiniteRoot:
     def rotate(left: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         rest, tail = left
         pivot, lead = rest[0, 0], tail[0]
-        squared = (pivot - lead) * (pivot + lead)
+        # Relative to the pivot, so that the square of a small one cannot underflow.
+        sine = jnp.where(pivot > 0, lead / jnp.where(pivot > 0, pivot, 1), 0)
+        squared = (1 - sine) * (1 + sine)
         good = (squared > 0) & (pivot > 0)
-        root = jnp.sqrt(jnp.where(good, squared, 1))
-        safe = jnp.where(good, pivot, 1)
-        cosine, sine = root / safe, jnp.where(good, lead / safe, 0)
+        cosine, sine = jnp.sqrt(jnp.where(good, squared, 1)), jnp.where(good, sine, 0)
         column = (rest[1:, 0] - sine * tail[1:]) / cosine
         tail = cosine * tail[1:] - sine * column
-        whole = jnp.concatenate([jnp.where(good, root, 0)[None], column])
+        whole = jnp.concatenate([jnp.where(good, pivot * cosine, 0)[None], column])
         return (rest[1:, 1:], tail), (good | ((pivot == 0) & (lead == 0)), whole)
 
     done, columns = _by_columns(rotate, (L, v))

@@ -66,7 +66,7 @@ def kf(model: Model) -> Filter:
             if shapes do not fit together.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-7 for a
-    ratio of measurement to prior sigma of 1e-6 in float64, to 1e-3 for 1e-2 in float32; beyond
+    ratio of measurement to prior sigma of 1e-6 in float64, to 1e-3 for 3e-3 in float32; beyond
     that a flag is raised, and :func:`~jaxnav.estimation.filters.square_root.square_root_kf` is the
     form to use.
 

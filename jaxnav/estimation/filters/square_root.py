@@ -68,7 +68,8 @@ def square_root_kf(model: Model) -> Filter:
     one device, or set the environment variable ``NPROC`` to 4 or more before JAX starts.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
-    ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32.
+    ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32; the
+    gradient of the log-likelihood is right to 1e-6 for 1e-8 in float64.
 
     References:
         Kailath, Sayed, Hassibi (2000), Linear Estimation, section 12.3.
