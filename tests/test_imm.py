@@ -243,6 +243,7 @@ def navigation(count: int) -> tuple[FilterParams, SinsTotalInput, Obs]:
     return members, inputs, Obs(z, jnp.ones((8, 3), bool))
 
 
+@pytest.mark.slow
 def test_limits_on_the_manifold() -> None:
     """To 1e-9 of each standard deviation: the tangent space is entered and left every step."""
     base = ekf(SINS)

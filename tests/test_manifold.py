@@ -192,6 +192,7 @@ def filtered(filter: Filter, star: StarForm, rule: SigmaRule | tuple[()] = ()) -
     return estimate
 
 
+@pytest.mark.slow
 @each_star
 def test_filters_agree_at_errors_of_arc_seconds(star: StarForm) -> None:
     """What is of second order in arc seconds is lost in the estimates of all forms and rules."""

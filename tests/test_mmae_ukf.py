@@ -1,4 +1,4 @@
-"""The study mmae-ukf: the figures it must reach at full size, consistency, and bad input."""
+"""The study mmae-ukf: the figures it must reach at full length, consistency, and bad input."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import pytest
 
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf
-from jaxnav.estimation.metrics import Interval, chi2_mean_bounds, nees, rmse_ratio
+from jaxnav.estimation.metrics import chi2_mean_bounds, nees, rmse_ratio
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs
@@ -44,6 +44,11 @@ from jaxnav.units import DEG
         ({"alpha": 0.0}, "alpha is 0.0"),
         ({"kappa": -15.0}, "kappa is -15.0; it must be above -15"),
         ({"misalignment_deg": 120.0}, "misalignment_deg is 120.0"),
+        (
+            {"scenario": "large-misalignment", "misalignment_deg": 85.0},
+            "sigma points stay within half a turn",
+        ),
+        ({"duration_s": 600.0}, "duration_s is 600.0; it must be below 465 s"),
         ({"star": "quaternion"}, "star is quaternion; it must be one of rotation-vector, euler"),
         ({"switching": 1.0}, "switching is 1.0"),
         ({"filter_period_s": 0.013}, "filter_period_s is 0.013"),
@@ -111,37 +116,38 @@ def test_run_is_made_once_per_shape() -> None:
     assert run_one(setup, 10) is run_one(setup_of(MmaeUkfConfig(seed=3)), 10)
 
 
+PAPER = MmaeUkfConfig(runs=60)
+"""Flights at full length, enough of them for every interval that is asserted here; the command line
+runs a hundred."""
+
+
 @pytest.fixture(scope="module")
 def paper() -> Campaign:
-    return run_campaign(MmaeUkfConfig())
-
-
-def change(campaign: Campaign, method: str, rival: str) -> Interval:
-    return gain(campaign, method, rival)
+    return run_campaign(PAPER)
 
 
 def judge_fading_and_oracle(campaign: Campaign) -> None:
     """What holds in either direction of the schedule."""
     assert campaign.finite.all()
     for bank, single in (("mmae-ekf", "ekf"), ("mmae-ukf", "ukf")):
-        plain = change(campaign, bank, single)
+        plain = gain(campaign, bank, single)
         assert plain.high < 0
         assert -0.025 < plain.value < -0.01
     for bank in ("immae-ukf", "imm-ukf"):
-        assert change(campaign, bank, "ukf").value < -0.05
-    assert -0.095 < change(campaign, "oracle", "ukf").value < -0.07
+        assert gain(campaign, bank, "ukf").value < -0.05
+    assert -0.095 < gain(campaign, "oracle", "ukf").value < -0.07
     squares = campaign.rows.mean_square.mean(axis=-1)
     for name in METHODS[:-1]:
         assert rmse_ratio(squares[:, METHODS.index(name)], squares[:, -1]).low > 1
     for ours, rival in (("ukf", "ekf"), ("mmae-ukf", "mmae-ekf")):
-        same = change(campaign, ours, rival)
+        same = gain(campaign, ours, rival)
         assert max(abs(same.low), abs(same.high)) < 0.005
 
 
 @pytest.mark.slow
-def test_paper_at_full_size(paper: Campaign) -> None:
+def test_paper_at_full_length(paper: Campaign) -> None:
     judge_fading_and_oracle(paper)
-    claims = {claim.id: claim for claim in assess(MmaeUkfConfig(), paper, None)}
+    claims = {claim.id: claim for claim in assess(PAPER, paper, None)}
     for bank, single in (("mmae-ekf", "ekf"), ("mmae-ukf", "ukf")):
         assert claims[f"{bank}-beats-{single}"].verdict == "reproduced"
     for ours, rival in (("ukf", "ekf"), ("mmae-ukf", "mmae-ekf")):
@@ -154,7 +160,7 @@ def test_paper_at_full_size(paper: Campaign) -> None:
 def test_plain_bank_remembers_and_the_others_forget(paper: Campaign) -> None:
     """At the end the noise is twice nominal; the plain bank stays with the flight's average."""
     weights = paper.mean_curve["weights"]
-    factors = np.log2(model_factors(MmaeUkfConfig())[:, 0])
+    factors = np.log2(model_factors(PAPER)[:, 0])
     mean_factor = {
         name: 2 ** (weights[-200:, BANKS.index(name)].mean(axis=0) @ factors) for name in BANKS
     }
@@ -165,7 +171,7 @@ def test_plain_bank_remembers_and_the_others_forget(paper: Campaign) -> None:
 
 @pytest.mark.slow
 def test_reversed_schedule() -> None:
-    judge_fading_and_oracle(run_campaign(MmaeUkfConfig(scenario="reversed", runs=40)))
+    judge_fading_and_oracle(run_campaign(MmaeUkfConfig(scenario="reversed", runs=30)))
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +195,7 @@ def test_results_hold_every_method_and_array(short: StudyResult) -> None:
     weights = short.arrays["mean_weights"]
     assert weights.shape == (60, len(BANKS), 2)
     np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=1e-12)
-    assert {claim.verdict for claim in short.claims} == {"not testable"}
+    assert {claim.verdict for claim in short.claims[:-1]} == {"not testable"}
     assert short.arrays["settling"].shape == (len(FORMS), len(ANGLES_DEG), len(FILTERS), 2)
 
 
@@ -203,7 +209,7 @@ def test_figures_are_drawn(short: StudyResult, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_large_misalignment_separates_the_filters() -> None:
     """With Euler angles the UKF settles sooner; with rotation vectors the filters are alike."""
-    times = settling_times(MmaeUkfConfig(scenario="large-misalignment", runs=40))
+    times = settling_times(MmaeUkfConfig(scenario="large-misalignment", runs=24))
     middle = np.median(times, axis=-1)
     euler, vector = FORMS.index("euler"), FORMS.index("rotation-vector")
     twenty = ANGLES_DEG.index(20.0)

@@ -68,7 +68,8 @@ class Info(NamedTuple):
         innovation: ``(m,)`` measured minus predicted; zero in invalid channels.
         innovation_cov: ``(m, m)``; an invalid channel has the row of the identity.
         log_likelihood: Log-density of the valid channels given the past [nats]; ``-inf`` if the
-            update failed, which rules a member of a bank out for good.
+            update failed, which rules a member of a bank out for good; 0 for a bank all of whose
+            members failed.
         nis: Normalised innovation squared, chi-square with ``sum(valid)`` degrees of freedom.
         iterations: Number of iterations of the update.
         flags: Sum of :class:`Flag`.

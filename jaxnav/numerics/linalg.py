@@ -165,6 +165,9 @@ def semidefinite_root(A: Array) -> SemidefiniteRoot:
     n = A.shape[0]
     diagonal = jnp.diag(A)
     sound = jnp.all(diagonal >= 0)
+    # A zero variance beside a covariance has no negative pivot: its column would go unseen.
+    null = diagonal == 0
+    coupled = jnp.any((null[:, None] | null[None, :]) & (A != 0))
     rounding = 2 * n * jnp.finfo(A.dtype).eps
 
     def eliminate(rest: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -176,7 +179,7 @@ def semidefinite_root(A: Array) -> SemidefiniteRoot:
     pivots, columns = _by_columns(eliminate, A + rounding * jnp.diag(diagonal))
     lowest = jnp.min(jnp.stack(pivots) / jnp.where(diagonal > 0, diagonal, 1))
     factor = jnp.where(sound, _lower(columns), jnp.nan)
-    return SemidefiniteRoot(factor, sound & (lowest >= -8 * rounding))
+    return SemidefiniteRoot(factor, sound & ~coupled & (lowest >= -8 * rounding))
 
 
 def _by_columns(

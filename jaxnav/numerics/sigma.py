@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import numpy as np
 from jax import Array
 from jax.core import Tracer
 
@@ -35,6 +36,12 @@ def unscented(
         lambda = alpha^2 (n + kappa) - n,   spread = sqrt(n + lambda),
         weight = 1 / (2 (n + lambda)),      centre = lambda / (n + lambda) + 1 - alpha^2 + beta
 
+    Args:
+        n: Number of states.
+        alpha: Spread of the points; a number, ``()``, or ``(M,)`` for the members of a bank.
+        beta: Likewise; 2 is best for a Gaussian prior.
+        kappa: Likewise; secondary spread.
+
     Raises:
         ValueError: If ``n + lambda`` is a number and not positive: there is then no real spread and
             the weights have no meaning.
@@ -44,7 +51,7 @@ def unscented(
         al. (2018), Eqs. (13)-(22), where ``w_i`` is printed ``1 (2 (n + lambda))``.
     """
     total = alpha**2 * (n + kappa)
-    if not isinstance(total, Tracer) and not total > 0:
+    if not isinstance(total, Tracer) and not np.all(np.asarray(total) > 0):
         raise ValueError(
             f"alpha = {alpha}, kappa = {kappa} give n + lambda = alpha^2 (n + kappa) = {total} for "
             f"n = {n} states; it must be positive: alpha not zero and kappa above {-n}"

@@ -176,15 +176,14 @@ def untested(config: Any, free: tuple[str, ...]) -> str | None:
     """Return what keeps a configuration from testing a paper's claims, if anything does.
 
     Args:
-        config: The configuration; the paper's scenario is its class with no arguments.
-        free: Fields a test of the claims may vary: the size of the study and what the paper leaves
-            open.
+        config: The configuration; the scenario that is tested is its class with no arguments.
+        free: Fields a test of the claims may vary without becoming a test of something else.
     """
     if config.runs < 2:
         return "one run has no interval"
     paper, given = plain(type(config)()), plain(config)
     changed = [name for name in paper if name not in free and paper[name] != given[name]]
-    return f"{', '.join(changed)} differ from the paper's scenario" if changed else None
+    return f"not at the study's default: {', '.join(changed)}" if changed else None
 
 
 def verdict(holds: bool) -> str:
@@ -205,9 +204,9 @@ class StudyResult:
         methods: Per method id, the measures of ``summary.json``.
         published: The paper's numbers: ``source`` and ``methods``.
         claims: The claims with their verdicts.
-        arrays: Named arrays for ``arrays.npz`` and the figures; the first axis of each is named in
-            ``dims``.
-        dims: Per array, the names of its axes.
+        arrays: Named arrays for ``arrays.npz`` and the figures. One that is named like an axis
+            holds that axis' coordinates and needs no entry in ``dims``.
+        dims: Per array, the names of all its axes.
         notes: Sentences for the reader of the table.
     """
 

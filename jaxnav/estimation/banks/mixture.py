@@ -194,7 +194,10 @@ def _log_prior(log_prior: Any, name: str, count: int, dtype: Any) -> Array:
     given = None if log_prior is None else log_prior[name]
     if given is None:
         return normalise(jnp.zeros((count,), dtype))
-    return normalise(jnp.asarray(given, dtype))
+    given = jnp.asarray(given, dtype)
+    if given.shape != (count,):
+        raise ValueError(f"log_prior is {given.shape}; a bank of {count} members needs ({count},)")
+    return normalise(given)
 
 
 def moment_match(
@@ -250,12 +253,14 @@ def mixture_info(log_weights: Array, info: Info) -> Info:
     """Return the info of a bank from its predictive log-weights ``(M,)`` and its members' info.
 
     The log-likelihood is the mixture's, ``log sum w_i N(nu_i; 0, S_i)``; innovation, its covariance
-    and the NIS are those of the moment-matched prediction.
+    and the NIS are those of the moment-matched prediction of the members that did not fail. If all
+    failed the log-likelihood is 0 and :attr:`Flag.ALL_MODELS_VETOED` is raised.
     """
     joint = log_weights + member_log_likelihood(info.log_likelihood)
     vetoed = ~jnp.any(active(joint))
     evidence = jax.nn.logsumexp(jnp.where(vetoed, 0, joint))
-    innovation, S = moment_match(log_weights, Gaussian(info.innovation, info.innovation_cov))
+    heard = normalise(jnp.where(active(joint) | vetoed, log_weights, -jnp.inf))
+    innovation, S = moment_match(heard, Gaussian(info.innovation, info.innovation_cov))
     root = cholesky(symmetrise(S))
     whitened = solve_lower(root.factor, innovation)
     used = active(log_weights)
@@ -265,7 +270,7 @@ def mixture_info(log_weights: Array, info: Info) -> Info:
         innovation=innovation,
         innovation_cov=S,
         log_likelihood=jnp.where(vetoed, 0, evidence),
-        nis=jnp.sum(whitened * whitened),
+        nis=jnp.where(root.positive_definite, jnp.sum(whitened * whitened), 0),
         iterations=jnp.max(jnp.where(used, info.iterations, 0)),
         flags=jax.lax.reduce(bits, jnp.zeros((), jnp.int32), jax.lax.bitwise_or, (0,)) | raised,
     )

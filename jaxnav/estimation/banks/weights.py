@@ -172,6 +172,9 @@ def switched(log_weights: Array, transition: Array) -> Switched:
         log_weights: Before the step; members at ``-inf`` stay there, and what would go to them is
             shared out.
         transition: ``(M, M)``; ``transition[i, j]`` is the probability to go from ``i`` to ``j``.
+
+    A model that no member can reach is ruled out and stays so: give one that the chain reaches
+    later a small weight, not ``-inf``. If none can be reached the weights are kept.
     """
     members = active(log_weights)
     possible = (transition > 0) & members[:, None] & members[None, :]
@@ -182,7 +185,8 @@ def switched(log_weights: Array, transition: Array) -> Switched:
     total = jax.nn.logsumexp(jnp.where(reached[None], joint, 0), axis=0)
     itself = jnp.where(jnp.eye(members.shape[0], dtype=bool), 0.0, -jnp.inf).astype(joint.dtype)
     origins = jnp.where(reached[None], joint - total[None], itself)
-    return Switched(normalise(jnp.where(reached, total, -jnp.inf)), origins)
+    moved = normalise(jnp.where(reached, total, -jnp.inf))
+    return Switched(jnp.where(jnp.any(reached), moved, log_weights), origins)
 
 
 def switch() -> WeightRule:

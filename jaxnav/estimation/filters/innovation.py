@@ -10,7 +10,7 @@ from jax import Array
 from jaxnav.estimation.types import Flag, Gaussian, Info, Model, Obs
 from jaxnav.numerics.linalg import Cholesky, log_det, solve_lower
 
-DIGITS_LEFT = 1e3
+ILL_CONDITIONED_EPS = 1e3
 """Multiple of the machine epsilon below which a Cholesky pivot is called ill-conditioned."""
 
 
@@ -93,7 +93,7 @@ def innovation_info(
     nis = jnp.where(usable, jnp.sum(whitened * whitened), 0)
     channels = jnp.sum(valid).astype(S.dtype)
     log_likelihood = -0.5 * (nis + log_det(root.factor) + channels * math.log(2 * math.pi))
-    few_digits = root.reciprocal_pivot < DIGITS_LEFT * jnp.finfo(S.dtype).eps
+    few_digits = root.reciprocal_pivot < ILL_CONDITIONED_EPS * jnp.finfo(S.dtype).eps
     raised = {
         Flag.NO_OBSERVATION: ~jnp.any(valid),
         Flag.NOT_POSITIVE_DEFINITE: ~usable,

@@ -53,7 +53,7 @@ class SigmaPointState(NamedTuple):
         x: A point of the state's manifold.
         P: Covariance in its tangent space.
         points: The propagated :class:`Cloud` about ``x``; ``()`` if points are drawn anew.
-        indefinite: Whether the last prediction had to mend a covariance.
+        indefinite: Whether a covariance was mended in making this state; the next update tells.
     """
 
     x: Point
@@ -138,6 +138,13 @@ def ckf(model: Model, *, redraw: bool = True) -> Filter:
     All weights are positive, so no covariance can become indefinite other than by rounding. The
     range is that of :func:`ukf`; with 15 states in float32 it is right to 1e-3.
 
+    Args:
+        model: The model.
+        redraw: As for :func:`ukf`.
+
+    Raises:
+        ValueError: In a run, if shapes do not fit together.
+
     References:
         Arasaratnam and Haykin (2009), IEEE Trans. Automatic Control 54(6).
     """
@@ -148,6 +155,8 @@ def square_root_ukf(
     model: Model, *, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
 ) -> Filter:
     """Return the unscented filter in array (QR) square-root form; points are always redrawn.
+
+    Arguments, parameters and errors are those of :func:`ukf`.
 
         [sqrt(w) e_i, sqrt(Q)] Theta = [L-, 0]
         [sqrt(R), sqrt(w) d_i; 0, sqrt(w) e_i] Theta = [sqrt(S), 0; K sqrt(S), L]
@@ -172,7 +181,7 @@ def square_root_ukf(
 def square_root_ckf(model: Model) -> Filter:
     """Return the cubature filter in the form of :func:`square_root_ukf`; it never downdates.
 
-    Range as there.
+    Arguments, errors and range are as there.
 
     References:
         Arasaratnam and Haykin (2009), IEEE Trans. Automatic Control 54(6), appendix B.
@@ -186,12 +195,9 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
     def init(params: FilterParams) -> SigmaPointState:
         require_prior(model, params.initial)
         rule = _rule(params, rule_of, params.initial.cov.shape[0])
-        return place(params.initial, rule)
-
-    def place(given: Gaussian, rule: SigmaRule) -> SigmaPointState:
-        root = semidefinite_root(given.cov)
+        root = semidefinite_root(params.initial.cov)
         points = () if redraw else drawn(rule, root.factor)
-        return SigmaPointState(given.mean, given.cov, points, ~root.semidefinite)
+        return SigmaPointState(*params.initial, points, ~root.semidefinite)
 
     def predict(params: FilterParams, state: SigmaPointState, u: Input) -> SigmaPointState:
         rule = _rule(params, rule_of, state.P.shape[0])
@@ -200,7 +206,8 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
         P = symmetrise(_second_moment(rule, cloud, cloud)) + Q
-        return SigmaPointState(x, P, () if redraw else cloud, ~root.semidefinite)
+        mended = state.indefinite | ~root.semidefinite
+        return SigmaPointState(x, P, () if redraw else cloud, mended)
 
     def update(
         params: FilterParams, state: SigmaPointState, u: Input, obs: Obs
@@ -228,7 +235,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
             P = state.P - matmul(gain.T, matmul(S, gain))
         x = model.retract(state.x, matmul(gain.T, nu))
         info = innovation_info(nu, S, factor, obs.valid, indefinite)
-        return SigmaPointState(x, symmetrise(P), state.points, indefinite), info
+        return SigmaPointState(x, symmetrise(P), state.points, jnp.zeros_like(indefinite)), info
 
     def estimate(state: SigmaPointState) -> Gaussian:
         return Gaussian(state.x, state.P)
@@ -245,6 +252,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
 
     def init(params: FilterParams) -> SquareRootSigmaPointState:
         require_prior(model, params.initial)
+        _rule(params, rule_of, params.initial.cov.shape[0])
         root = semidefinite_root(params.initial.cov)
         return SquareRootSigmaPointState(params.initial.mean, root.factor, ~root.semidefinite)
 
@@ -256,9 +264,11 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
         points, centre = _weighted(rule, cloud)
-        L = tria(jnp.concatenate([points, centre.above, semidefinite_root(Q).factor], axis=1))
+        noise = semidefinite_root(Q)
+        L = tria(jnp.concatenate([points, centre.above, noise.factor], axis=1))
         L, sound = _without(rule, L, centre)
-        return SquareRootSigmaPointState(x, L, ~sound)
+        mended = state.indefinite | ~sound | ~noise.semidefinite
+        return SquareRootSigmaPointState(x, L, mended)
 
     def update(
         params: FilterParams, state: SquareRootSigmaPointState, u: Input, obs: Obs
@@ -276,10 +286,10 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         columns = jnp.concatenate([points, centre.above], axis=1)
         triangle, sound = _without(rule, tria(update_array(R, columns[:m], columns[m:])), centre)
         done = read_array(triangle, m, state.L)
-        x = model.retract(state.x, done.gain @ solve_lower(done.root.factor, nu))
+        x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         indefinite = state.indefinite | ~sound
         info = innovation_info(nu, done.S, done.root, obs.valid, indefinite)
-        return SquareRootSigmaPointState(x, done.L, indefinite), info
+        return SquareRootSigmaPointState(x, done.L, jnp.zeros_like(indefinite)), info
 
     def estimate(state: SquareRootSigmaPointState) -> Gaussian:
         return Gaussian(state.x, state.L @ state.L.T)
@@ -298,7 +308,14 @@ def drawn(rule: SigmaRule, L: Array) -> Cloud:
 
 
 def _rule(params: FilterParams, rule_of: RuleOf, n: int) -> SigmaRule:
-    return params.sigma if isinstance(params.sigma, SigmaRule) else rule_of(n)
+    if isinstance(params.sigma, SigmaRule):
+        return params.sigma
+    if not isinstance(params.sigma, tuple) or params.sigma:
+        raise ValueError(
+            f"sigma is a {type(params.sigma).__name__}; it must be a SigmaRule, or () for the rule "
+            "that the filter was built with"
+        )
+    return rule_of(n)
 
 
 def _propagate(
@@ -357,12 +374,12 @@ class _CentreColumn(NamedTuple):
 
 def _weighted(rule: SigmaRule, cloud: Cloud) -> tuple[Array, _CentreColumn]:
     """Return the points as columns ``(d, 2 n)`` of a root of their second moment."""
-    sign = jnp.asarray(rule.centre, cloud.centre.dtype)
-    size = jnp.abs(sign)
+    weight = jnp.asarray(rule.centre, cloud.centre.dtype)
+    size = jnp.abs(weight)
     # the root of a zero weight would have no derivative
     root = jnp.where(size > 0, jnp.sqrt(jnp.where(size > 0, size, 1)), 0)
     column = (root * cloud.centre)[:, None]
-    above, below = jnp.where(sign > 0, column, 0), jnp.where(sign < 0, column, 0)
+    above, below = jnp.where(weight > 0, column, 0), jnp.where(weight < 0, column, 0)
     return rule.weight**0.5 * cloud.offsets.T, _CentreColumn(above, below)
 
 

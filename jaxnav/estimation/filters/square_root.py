@@ -43,13 +43,13 @@ class ArrayUpdate(NamedTuple):
     Attributes:
         S: ``(m, m)`` innovation covariance.
         root: Its lower factor with its health.
-        gain: ``(n, m)`` the gain times that factor; zero if the factor is not usable.
+        gain_root: ``(n, m)`` the gain times that factor; zero if the factor is not usable.
         L: ``(n, n)`` factor of the updated covariance; the predicted one if it is not.
     """
 
     S: Array
     root: Cholesky
-    gain: Array
+    gain_root: Array
     L: Array
 
 
@@ -61,8 +61,9 @@ def square_root_kf(model: Model) -> Filter:
 
     with ``Theta`` orthogonal. Parameters, offsets and invalid channels are as in
     :func:`~jaxnav.estimation.filters.kalman.kf`, and so are the errors raised. ``P``, ``Q`` and
-    ``R`` may be singular; gradients need ``[Phi L, sqrt(Q)]`` of full row rank. The two QR
-    factorisations of a step cost far more than the Joseph form does.
+    ``R`` may be singular; one that is indefinite loses the columns of its negative pivots, without
+    a flag. Gradients need ``[Phi L, sqrt(Q)]`` of full row rank. The two QR factorisations of a
+    step cost far more than the Joseph form does.
 
     Batched QR of several host devices at once can wait for ever inside XLA: give ``monte_carlo``
     one device, or set the environment variable ``NPROC`` to 4 or more before JAX starts.
@@ -103,7 +104,7 @@ def square_root_ekf(model: Model) -> Filter:
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         HL = jnp.where(obs.valid[:, None], push(state.L), 0)
         done = read_array(tria(update_array(R, HL, state.L)), HL.shape[0], state.L)
-        x = model.retract(state.x, done.gain @ solve_lower(done.root.factor, nu))
+        x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         return SquareRootState(x, done.L), innovation_info(nu, done.S, done.root, obs.valid)
 
     def estimate(state: SquareRootState) -> Gaussian:

@@ -135,7 +135,12 @@ def sins_total(
     Returns:
         A model with :class:`SinsTotalParams` and :class:`SinsTotalInput`, three channels and
         analytic Jacobians.
+
+    Raises:
+        ValueError: If ``star`` is neither.
     """
+    if star not in _STAR:
+        raise ValueError(f"star is {star!r}; it must be one of {', '.join(_STAR)}")
     observe, residual, noise, observed = _STAR[star]
 
     def transition(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> SinsTotal:
@@ -168,7 +173,7 @@ def sins_total(
     ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
         s = LAYOUT
         turn = u.dtheta - period * x.drift
-        felt = matmul(x.dcm, u.dvel - period * (x.bias + 0.5 * jnp.cross(x.drift, u.dvel)))
+        pushed = matmul(x.dcm, u.dvel - period * (x.bias + 0.5 * jnp.cross(x.drift, u.dvel)))
         turning = matmul(x.dcm, so3_left_jacobian(turn))
         pull = gravity_gradient_launch_inertial(x.position + 0.5 * period * x.velocity, radius)
         fading = jnp.exp(-period / params.bias_time)
@@ -176,7 +181,7 @@ def sins_total(
         def moved(d: Array) -> Array:
             sensed = d[s.nabla] + 0.5 * jnp.cross(d[s.eps], u.dvel)
             gained = (
-                jnp.cross(d[s.phi], felt)
+                jnp.cross(d[s.phi], pushed)
                 - period * matmul(x.dcm, sensed)
                 + period * matmul(pull, d[s.dr] + 0.5 * period * d[s.dv])
             )

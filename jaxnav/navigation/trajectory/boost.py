@@ -20,7 +20,7 @@ class BoostProfile(NamedTuple):
     """A burn at constant thrust and flow of mass, with a pitch-over between two instants.
 
     The paper prints no numbers for the vehicle, so all defaults are ours. Over 300 s the thrust per
-    mass rises from 16 to 45 m/s^2, which at a constant flow is an exhaust velocity of 7.5 km/s: the
+    mass rises from 16 to 45 m/s^2, which at a constant flow is an exhaust velocity of 7.4 km/s: the
     one stage stands for several. The engine burns for as long as the motion is asked for, which
     must end before the mass does, after 465 s by default.
 

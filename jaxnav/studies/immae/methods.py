@@ -161,7 +161,7 @@ def run_one(chain_name: str, period: float, imu_step: float, models: int) -> Any
         weights = weights[:, :, :models]
         row = _row(error, consistency, weights)
         sigma = jnp.sqrt(jnp.diagonal(attitude.cov, axis1=-2, axis2=-1))
-        curve = {"square": error**2, "nees": consistency, "weights": weights}
+        curve = {"square": error**2, "weights": weights}
         kept = {"error": error, "weights": weights, "sigma": sigma}
         return RunOutput(row, curve, kept)
 

@@ -34,10 +34,11 @@ class MmaeUkfConfig:
         seed: Root seed; run i is the same for any number of runs.
         star: How the star tracker's attitude is observed, "rotation-vector" or "euler"; the default
             is "euler" for "large-misalignment", where it matters, and the former otherwise.
-        duration_s: Flight time [s].
+        duration_s: Flight time [s]; below the 465 s after which the vehicle has no mass left.
         ins_rate_hz: Output rate of the inertial sensors [Hz].
         filter_period_s: Period of the filter and of the star tracker [s].
-        latitude_deg: Geodetic latitude of the launch point [deg]; sets the Earth's radius.
+        latitude_deg: Geodetic latitude of the launch point [deg]; sets the radius of the Earth,
+            that of the meridian's curvature.
         gyro_noise_deg_h: Nominal standard deviation ``wgt0`` of one gyro sample [deg/h].
         accel_noise_ug: Nominal standard deviation ``wga0`` of an accelerometer sample [micro g].
         accel_error_ug: Standard deviation of the Markov error of the accelerometers [micro g].
@@ -117,9 +118,27 @@ class MmaeUkfConfig:
             self.settle_s,
             f"between 0 and the flight time of {self.duration_s} s",
         )
+        require(
+            self.duration_s < LONGEST_S,
+            "duration_s",
+            self.duration_s,
+            f"below {LONGEST_S:g} s, when the vehicle has no mass left",
+        )
+        # Beyond half a turn the sigma points would come round the other side.
+        reach = abs(self.alpha) * max(STATES + self.kappa, 0) ** 0.5 * self.misalignment_deg
+        require(
+            not scored or reach < 180 * 3**0.5,
+            "misalignment_deg",
+            self.misalignment_deg,
+            "so small that the sigma points stay within half a turn",
+        )
         require(self.models >= 1, "models", self.models, "at least 1")
-        low, high = self.model_range
-        require(low < high, "model_range", self.model_range, "a lower and a higher factor")
+        require(
+            len(self.model_range) == 2 and self.model_range[0] < self.model_range[1],
+            "model_range",
+            self.model_range,
+            "a lower and a higher factor",
+        )
         require(self.alpha != 0, "alpha", self.alpha, "other than zero")
         require(self.kappa > -STATES, "kappa", self.kappa, f"above -{STATES}")
 
@@ -160,6 +179,8 @@ class MmaeUkfConfig:
 
 STATES = 15
 """Tangent coordinates of the state."""
+LONGEST_S = 465.0
+"""Flight time at which the default vehicle has burnt all of its mass [s]."""
 
 _POSITIVE = (
     "duration_s",

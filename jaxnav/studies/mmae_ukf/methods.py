@@ -287,7 +287,7 @@ def _judge(
         settled=steps_outside(size, world),
     )
     sigma = jnp.sqrt(jnp.diagonal(attitude.cov, axis1=-2, axis2=-1))
-    curve = {"square": error**2, "nees": consistency, "weights": weights}
+    curve = {"square": error**2, "weights": weights}
     return RunOutput(row, curve, {"error": error, "weights": weights, "sigma": sigma})
 
 

@@ -64,7 +64,7 @@ class Run(NamedTuple):
 
 
 def launch_radius(config: MmaeUkfConfig) -> float:
-    """Return the distance from the Earth's centre to the launch point [m]."""
+    """Return the radius of the Earth [m]: the meridian's radius of curvature."""
     return float(meridian_radius(config.latitude_deg * DEG))
 
 
@@ -98,6 +98,12 @@ def prior_sigma(config: MmaeUkfConfig) -> Array:
     )
 
 
+def true_scale(config: MmaeUkfConfig) -> Array:
+    """Return the true factor on the noise variances at each filter step ``(K,)``."""
+    third = 3 * jnp.arange(config.steps) // config.steps
+    return jnp.array(config.schedule)[third] ** 2
+
+
 def build_world(config: MmaeUkfConfig) -> World:
     """Fly the trajectory and prepare what all runs share."""
     every = config.samples_per_step
@@ -107,8 +113,7 @@ def build_world(config: MmaeUkfConfig) -> World:
         step=config.imu_step,
         radius=launch_radius(config),
     )
-    third = 3 * jnp.arange(config.steps) // config.steps
-    step_scale = jnp.array(config.schedule)[third] ** 2
+    step_scale = true_scale(config)
     large = config.scenario == "large-misalignment"
     return World(
         trajectory=trajectory,

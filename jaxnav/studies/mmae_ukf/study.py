@@ -20,7 +20,7 @@ from jaxnav.studies.mmae_ukf.methods import (
     setup_of,
     shared_of,
 )
-from jaxnav.studies.mmae_ukf.simulation import build_world
+from jaxnav.studies.mmae_ukf.simulation import build_world, true_scale
 from jaxnav.units import ARCSEC
 
 QUICKLY_S = 1.0
@@ -128,7 +128,7 @@ def _arrays(
     arrays |= {
         "settled": config.filter_period_s * campaign.rows.settled,
         "model_factors": model_factors(config),
-        "true_factor": np.sqrt(np.asarray(build_world(config).step_scale)),
+        "true_factor": np.sqrt(np.asarray(true_scale(config))),
         "hammersley_discrepancy": np.array([regular]),
         "uniform_discrepancy": uniform,
     }

@@ -35,9 +35,10 @@ def settling_times(config: MmaeUkfConfig) -> np.ndarray:
         config: The configuration of "large-misalignment".
 
     Returns:
-        ``(forms, angles, filters, runs)``; :data:`LENGTH_S` where it did not in that time.
+        ``(forms, angles, filters, runs)``; where it did not, the length of the flight:
+        :data:`LENGTH_S`, or the configuration's if that is shorter.
     """
-    steps = min(config.steps, round(LENGTH_S / config.filter_period_s))
+    steps = min(config.steps, max(1, round(LENGTH_S / config.filter_period_s)))
     world = build_world(config)
     short = world._replace(
         trajectory=_cut(world.trajectory, steps * config.samples_per_step),
