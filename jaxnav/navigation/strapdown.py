@@ -12,7 +12,7 @@ from jaxnav.numerics.linalg import matmul
 
 
 class NavState(NamedTuple):
-    """Navigation state: ``dcm`` C_ib ``(3, 3)``, ``velocity`` and ``position`` ``(3,)`` [m/s, m]."""
+    """Navigation state: ``dcm`` C_ib ``(3, 3)``, velocity ``(3,) [m/s]``, position ``(3,) [m]``."""
 
     dcm: Array
     velocity: Array
