@@ -9,7 +9,7 @@ import pytest
 
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf
-from jaxnav.estimation.metrics import chi2_mean_bounds, nees, rmse_ratio
+from jaxnav.estimation.metrics import chi2_mean_bounds, mean_interval, nees, rmse_ratio
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs
@@ -214,6 +214,7 @@ def test_large_misalignment_separates_the_filters() -> None:
     euler, vector = FORMS.index("euler"), FORMS.index("rotation-vector")
     twenty = ANGLES_DEG.index(20.0)
     assert middle[euler, twenty, 1] < middle[euler, twenty, 0]
+    assert mean_interval(times[euler, twenty, 1] - times[euler, twenty, 0]).high < 0
     np.testing.assert_allclose(middle[vector, :, 0], middle[vector, :, 1], atol=0.051)
 
 

@@ -16,9 +16,25 @@ DIVERGED_SIGMAS = 5.0
 
 
 def attitude_measures(
+    rows: Any, methods: Sequence[str], star_noise: float
+) -> dict[str, dict[str, Any]]:
+    """Return the entries of the methods in ``summary.json``.
+
+    Args:
+        rows: ``mean_square``, ``nees`` and ``final_error`` with axes of runs and methods.
+        methods: Names along the axis of methods.
+        star_noise: Standard deviation of the star tracker [rad].
+    """
+    return {
+        name: _measures(rows.mean_square[:, i], rows.nees[:, i], rows.final_error[:, i], star_noise)
+        for i, name in enumerate(methods)
+    }
+
+
+def _measures(
     mean_square: np.ndarray, nees: np.ndarray, final_error: np.ndarray, star_noise: float
 ) -> dict[str, Any]:
-    """Return the entry of one method in ``summary.json``.
+    """Return the entry of one method.
 
     Args:
         mean_square: ``(runs, 3) [rad^2]`` of the errors of yaw, pitch, roll.

@@ -13,7 +13,7 @@ from jaxnav.estimation.banks.mixture import (
     bank,
     likeliest,
 )
-from jaxnav.estimation.banks.weights import active, bayes, chain, switch, switched
+from jaxnav.estimation.banks.weights import active, bayes, switched
 from jaxnav.estimation.types import Filter, Gaussian, Info, Input, Obs
 
 SUM_TOLERANCE = 1e-6
@@ -41,28 +41,24 @@ def imm(filter: Filter) -> Filter:
         Blom and Bar-Shalom (1988), IEEE Trans. Automatic Control 33(8); Bar-Shalom, Li, Kirubarajan
         (2001), section 11.6.6.
     """
-    base = bank(filter, chain(switch(), bayes()))
+    base = bank(filter, bayes())
 
-    def chained(params: BankParams) -> BankParams:
-        return params._replace(rule=(params.rule, ()))
+    def weighed(params: BankParams) -> BankParams:
+        return params._replace(rule=())
 
     def init(params: BankParams) -> BankState:
-        count = jax.tree.leaves(params.members)[0].shape[0]
-        if jnp.shape(params.rule) != (count, count):
-            raise ValueError(
-                f"the transition matrix is {jnp.shape(params.rule)}; "
-                f"a bank of {count} members needs ({count}, {count})"
-            )
-        return base.init(chained(params))
+        _require_size(params.members, params.rule)
+        return base.init(weighed(params))
 
     def predict(params: BankParams, state: BankState, u: Input) -> BankState:
-        origins = switched(state.log_weights, params.rule).origins
+        log_weights, origins = switched(state.log_weights, params.rule)
         mixed = mix(origins, state.log_weights, jax.vmap(filter.estimate)(state.members), filter)
         members = jax.vmap(filter.restart)(state.members, mixed)
-        return base.predict(chained(params), state._replace(members=members), u)
+        moved = state._replace(members=members, log_weights=log_weights)
+        return base.predict(weighed(params), moved, u)
 
     def update(params: BankParams, state: BankState, u: Input, obs: Obs) -> tuple[BankState, Info]:
-        return base.update(chained(params), state, u, obs)
+        return base.update(weighed(params), state, u, obs)
 
     return base._replace(init=init, predict=predict, update=update)
 
@@ -79,13 +75,8 @@ def imm_params(members: Any, transition: Array, log_prior: Any = None) -> BankPa
         ValueError: If the matrix has another size, a negative entry, or a row that does not sum to
             one.
     """
-    count = jax.tree.leaves(members)[0].shape[0]
+    _require_size(members, transition)
     matrix = np.asarray(transition, float)
-    if matrix.shape != (count, count):
-        raise ValueError(
-            f"the transition matrix is {matrix.shape}; "
-            f"a bank of {count} members needs ({count}, {count})"
-        )
     if not np.all(matrix >= 0):
         raise ValueError(
             f"the transition matrix has the entry {matrix.min():g}; none may be negative"
@@ -97,6 +88,16 @@ def imm_params(members: Any, transition: Array, log_prior: Any = None) -> BankPa
             f"row {worst} of the transition matrix sums to {sums[worst]:g}; each must sum to 1"
         )
     return BankParams(members, transition, log_prior)
+
+
+def _require_size(members: Any, transition: Array) -> None:
+    """Raise ``ValueError`` unless a transition matrix has the size of the bank."""
+    count = jax.tree.leaves(members)[0].shape[0]
+    if jnp.shape(transition) != (count, count):
+        raise ValueError(
+            f"the transition matrix is {jnp.shape(transition)}; "
+            f"a bank of {count} members needs ({count}, {count})"
+        )
 
 
 def uniform_switching(count: int, probability: Array | float) -> Array:

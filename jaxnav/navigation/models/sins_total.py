@@ -144,9 +144,8 @@ def sins_total(
     observe, residual, noise, observed = _STAR[star]
 
     def transition(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> SinsTotal:
-        felt = u.dvel - period * (x.bias + 0.5 * jnp.cross(x.drift, u.dvel))
         pull = gravity_launch_inertial(x.position + 0.5 * period * x.velocity, radius)
-        velocity = x.velocity + matmul(x.dcm, felt) + period * pull
+        velocity = x.velocity + matmul(x.dcm, _felt(period, x, u)) + period * pull
         return SinsTotal(
             dcm=matmul(x.dcm, so3_exp(u.dtheta - period * x.drift)),
             velocity=velocity,
@@ -171,33 +170,47 @@ def sins_total(
     def jacobians(
         params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput
     ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-        s = LAYOUT
-        turn = u.dtheta - period * x.drift
-        pushed = matmul(x.dcm, u.dvel - period * (x.bias + 0.5 * jnp.cross(x.drift, u.dvel)))
-        turning = matmul(x.dcm, so3_left_jacobian(turn))
-        pull = gravity_gradient_launch_inertial(x.position + 0.5 * period * x.velocity, radius)
-        fading = jnp.exp(-period / params.bias_time)
-
-        def moved(d: Array) -> Array:
-            sensed = d[s.nabla] + 0.5 * jnp.cross(d[s.eps], u.dvel)
-            gained = (
-                jnp.cross(d[s.phi], pushed)
-                - period * matmul(x.dcm, sensed)
-                + period * matmul(pull, d[s.dr] + 0.5 * period * d[s.dv])
-            )
-            return jnp.concatenate(
-                [
-                    d[s.phi] - period * matmul(turning, d[s.eps]),
-                    d[s.dv] + gained,
-                    d[s.dr] + period * (d[s.dv] + 0.5 * gained),
-                    d[s.eps],
-                    fading * d[s.nabla],
-                ]
-            )
-
-        return moved, observed(x)
+        return _transition_differential(period, radius, params, x, u), observed(x)
 
     return Model(transition, process_noise, observe, noise, residual, retract, local, jacobians)
+
+
+def _felt(period: float, x: SinsTotal, u: SinsTotalInput) -> Array:
+    """Return the velocity increment ``(3,) [m/s]`` in body axes, less what the state says is error.
+
+    A drift also turns the axes in which the increments of the period were summed.
+    """
+    return u.dvel - period * (x.bias + 0.5 * jnp.cross(x.drift, u.dvel))
+
+
+def _transition_differential(
+    period: float, radius: Array | float, params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput
+) -> Callable[[Array], Array]:
+    """Return the derivative of the transition as a function of a tangent vector ``(15,)``."""
+    s = LAYOUT
+    pushed = matmul(x.dcm, _felt(period, x, u))
+    turning = matmul(x.dcm, so3_left_jacobian(u.dtheta - period * x.drift))
+    pull = gravity_gradient_launch_inertial(x.position + 0.5 * period * x.velocity, radius)
+    fading = jnp.exp(-period / params.bias_time)
+
+    def moved(d: Array) -> Array:
+        sensed = d[s.nabla] + 0.5 * jnp.cross(d[s.eps], u.dvel)
+        gained = (
+            jnp.cross(d[s.phi], pushed)
+            - period * matmul(x.dcm, sensed)
+            + period * matmul(pull, d[s.dr] + 0.5 * period * d[s.dv])
+        )
+        return jnp.concatenate(
+            [
+                d[s.phi] - period * matmul(turning, d[s.eps]),
+                d[s.dv] + gained,
+                d[s.dr] + period * (d[s.dv] + 0.5 * gained),
+                d[s.eps],
+                fading * d[s.nabla],
+            ]
+        )
+
+    return moved
 
 
 def _rotated(C: Array, variances: Array) -> Array:

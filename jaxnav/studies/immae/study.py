@@ -49,7 +49,7 @@ def _run_scenario(config: ImmaeConfig, progress: Callable[[int, int], None] | No
         runs=config.runs,
         seed=config.seed,
         config=plain(config),
-        methods=_measures(config, campaign),
+        methods=attitude_measures(campaign.rows, METHODS, config.star_noise_arcsec * ARCSEC),
         published=PUBLISHED.get(config.scenario, {}),
         claims=assess(config, campaign),
         arrays={**arrays, "model": np.array(config.theta)},
@@ -62,16 +62,3 @@ def run_campaign(config: ImmaeConfig, **options: Any) -> Campaign:
     one = run_one(config.chain, config.filter_period_s, config.imu_step, len(config.theta))
     shared = Shared(build_world(config), panel_params(config))
     return monte_carlo(one, jax.random.key(config.seed), config.runs, shared, **options)
-
-
-def _measures(config: ImmaeConfig, campaign: Campaign) -> dict[str, dict[str, Any]]:
-    rows = campaign.rows
-    return {
-        name: attitude_measures(
-            rows.mean_square[:, i],
-            rows.nees[:, i],
-            rows.final_error[:, i],
-            config.star_noise_arcsec * ARCSEC,
-        )
-        for i, name in enumerate(METHODS)
-    }

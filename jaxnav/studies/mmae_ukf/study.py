@@ -85,14 +85,8 @@ def _measures(
     config: MmaeUkfConfig, campaign: Campaign, costs: dict[str, float] | None
 ) -> dict[str, dict[str, Any]]:
     rows = campaign.rows
-    measures: dict[str, dict[str, Any]] = {}
+    measures = attitude_measures(rows, METHODS, config.star_noise_arcsec * ARCSEC)
     for i, name in enumerate(METHODS):
-        measures[name] = attitude_measures(
-            rows.mean_square[:, i],
-            rows.nees[:, i],
-            rows.final_error[:, i],
-            config.star_noise_arcsec * ARCSEC,
-        )
         if config.scenario == "large-misalignment":
             quick = config.filter_period_s * rows.settled[:, i] <= QUICKLY_S
             measures[name]["settled_quickly"] = float(np.mean(quick))

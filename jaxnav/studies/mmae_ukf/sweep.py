@@ -1,7 +1,7 @@
 """How the single filters settle after an initial attitude error of a few to many degrees."""
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -68,18 +68,14 @@ def _cut(trajectory: Any, samples: int) -> Any:
     )
 
 
-class _Pair(NamedTuple):
-    """The two single filters, in the order of :data:`FILTERS`."""
-
-    ekf: Filter
-    ukf: Filter
-
-
 @cache
 def _run_one(setup: Setup) -> Any:
     """Return one run of both filters: the steps after which each stays within the band."""
     model = model_of(setup)
-    pair = _Pair(ekf(model), ukf(model, alpha=setup.alpha, beta=setup.beta, kappa=setup.kappa))
+    filters = {
+        "ekf": ekf(model),
+        "ukf": ukf(model, alpha=setup.alpha, beta=setup.beta, kappa=setup.kappa),
+    }
 
     def settled(key: Array, world: World) -> RunOutput:
         flight = fly(key, world, setup.period, setup.imu_step, setup.star)
@@ -94,6 +90,6 @@ def _run_one(setup: Setup) -> Any:
             phi = jax.vmap(so3_local)(flight.truth.dcm, record)
             return steps_outside(jnp.sqrt(jnp.sum(phi**2, axis=-1)), world)
 
-        return RunOutput(jnp.stack([last_outside(filter) for filter in pair]))
+        return RunOutput(jnp.stack([last_outside(filters[name]) for name in FILTERS]))
 
     return settled
