@@ -74,6 +74,15 @@ if TYPE_CHECKING:
         windowed_reset as windowed_reset,
     )
     from jaxnav.estimation.bounds import oracle as oracle
+    from jaxnav.estimation.filters.iterated import (
+        iterated_ckf as iterated_ckf,
+    )
+    from jaxnav.estimation.filters.iterated import (
+        iterated_ekf as iterated_ekf,
+    )
+    from jaxnav.estimation.filters.iterated import (
+        modified_iterated_ckf as modified_iterated_ckf,
+    )
     from jaxnav.estimation.filters.kalman import ekf as ekf
     from jaxnav.estimation.filters.kalman import kf as kf
     from jaxnav.estimation.filters.sigma_point import ckf as ckf
@@ -140,6 +149,11 @@ _HOMES = {
         "windowed_reset",
     ),
     "jaxnav.estimation.bounds": ("oracle",),
+    "jaxnav.estimation.filters.iterated": (
+        "iterated_ckf",
+        "iterated_ekf",
+        "modified_iterated_ckf",
+    ),
     "jaxnav.estimation.filters.kalman": ("ekf", "kf"),
     "jaxnav.estimation.filters.sigma_point": (
         "ckf",

@@ -21,6 +21,7 @@ ORDER = (
     "estimation.filters.kalman",
     "estimation.filters.square_root",
     "estimation.filters.sigma_point",
+    "estimation.filters.iterated",
     "estimation.banks.weights",
     "estimation.banks.mixture",
     "estimation.banks.imm",
@@ -31,12 +32,14 @@ ORDER = (
     "estimation.tune",
     "estimation",
     "navigation.earth",
+    "navigation.atmosphere",
     "navigation.strapdown",
     "navigation.trajectory.base",
     "navigation.trajectory.rocket",
     "navigation.trajectory.boost",
     "navigation.sensors.imu",
     "navigation.sensors.star",
+    "navigation.sensors.refraction",
     "navigation.models.kinematic",
     "navigation.models.sins_cns",
     "navigation.models.sins_total",
@@ -166,7 +169,7 @@ def test_the_library_leaves_the_configuration_of_jax_alone() -> None:
 
 
 def test_public_names_exist_and_are_about_thirty() -> None:
-    assert 20 <= len(jaxnav.__all__) <= 40
+    assert 20 <= len(jaxnav.__all__) <= 45
     for name in jaxnav.__all__:
         assert getattr(jaxnav, name) is not None
 

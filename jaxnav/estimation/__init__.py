@@ -7,7 +7,7 @@ Knows nothing of navigation: a state-space model from any field is a :class:`~.t
 def catalogue() -> dict[str, dict[str, str]]:
     """Return the filters, banks and weight rules with the first line of their documentation."""
     from jaxnav.estimation.banks import imm, mixture, weights
-    from jaxnav.estimation.filters import kalman, sigma_point, square_root
+    from jaxnav.estimation.filters import iterated, kalman, sigma_point, square_root
 
     groups = {
         "filters": (
@@ -19,6 +19,9 @@ def catalogue() -> dict[str, dict[str, str]]:
             square_root.square_root_ekf,
             sigma_point.square_root_ukf,
             sigma_point.square_root_ckf,
+            iterated.iterated_ekf,
+            iterated.iterated_ckf,
+            iterated.modified_iterated_ckf,
         ),
         "banks": (mixture.bank, mixture.mmae, mixture.immae, imm.imm, mixture.panel),
         "weight rules": tuple(weights.RULES.values()),

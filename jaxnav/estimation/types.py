@@ -97,6 +97,18 @@ def subtract(x: Array, y: Array) -> Array:
     return y - x
 
 
+class NonAdditive(NamedTuple):
+    """An observation equation ``z = h(x, v)`` whose noise does not just add.
+
+    Attributes:
+        observe: ``(params, x, v, u) -> (m,)`` with ``observe(params, x, 0, u)`` the model's own.
+        noise: ``(params, x, u) -> (k, k)`` or ``(k,)``, the covariance of ``v`` or its diagonal.
+    """
+
+    observe: Callable[[Params, Point, Array, Input], Array]
+    noise: Callable[[Params, Point, Input], Array]
+
+
 class Model(NamedTuple):
     """A state-space model on a manifold; every function is pure and takes the parameters first.
 
@@ -117,6 +129,8 @@ class Model(NamedTuple):
         jacobians: ``(params, x, u) -> (Phi, H)`` in tangent coordinates, each a matrix or, for
             structure that a matrix would hide, the linear function it stands for; ``None`` for
             automatic differentiation.
+        noisy: The observation with noise that does not just add, for filters that augment the state
+            with it; ``observation_noise`` is then its covariance in the channels, to first order.
     """
 
     transition: Callable[[Params, Point, Input], Point]
@@ -127,6 +141,7 @@ class Model(NamedTuple):
     retract: Callable[[Point, Array], Point] = add
     local: Callable[[Point, Point], Array] = subtract
     jacobians: Callable[[Params, Point, Input], tuple[LinearMap, LinearMap]] | None = None
+    noisy: NonAdditive | None = None
 
 
 class FilterParams(NamedTuple):
@@ -137,11 +152,14 @@ class FilterParams(NamedTuple):
         initial: Mean and covariance at t0.
         sigma: :class:`~jaxnav.numerics.sigma.SigmaRule` of a sigma-point filter; ``()`` is the rule
             that the filter was built with.
+        search: :class:`~jaxnav.estimation.filters.iterated.Search` of an iterated filter; ``()`` is
+            the one that the filter was built with.
     """
 
     model: Params
     initial: Gaussian
     sigma: Any = ()
+    search: Any = ()
 
 
 class Filter(NamedTuple):

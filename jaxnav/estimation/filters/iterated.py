@@ -1,0 +1,414 @@
+"""Iterated filters: an update by Gauss-Newton on the posterior, with the prior held fixed.
+
+With ``P- = L L'`` and the state written as ``retract(x-, L xi)``, the posterior's mode minimises
+
+    T(xi) = |xi|^2 + |z - h(xi)|^2 in the norm of inv(R)
+
+and the step from an iterate ``xi`` is, with ``A = H L`` the slope of ``h`` there and ``nu`` the
+innovation,
+
+    S = A A' + R,   D = A' inv(S) (nu + A xi) - xi,   xi + a D with a from a back-tracking search
+
+In these coordinates the statistical linearisation by cubature points about an iterate is a central
+difference along the axes, and no covariance is ever inverted.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.filters.innovation import innovation_info, mask_noise, masked_innovation
+from jaxnav.estimation.filters.kalman import KalmanState, ekf
+from jaxnav.estimation.filters.sigma_point import SigmaPointState, ckf
+from jaxnav.estimation.types import (
+    Filter,
+    FilterParams,
+    Info,
+    Input,
+    Model,
+    NonAdditive,
+    Obs,
+    Params,
+    Point,
+)
+from jaxnav.numerics.linalg import (
+    Cholesky,
+    cholesky,
+    semidefinite_root,
+    solve_lower,
+    solve_lower_transposed,
+    symmetrise,
+)
+
+
+class Search(NamedTuple):
+    """The numbers of an iterated update: leaves, so that they may be tuned or differ in a bank.
+
+    Attributes:
+        spread: Spread of the cubature points about an iterate, as a factor on that of the prior:
+            1 is the paper's, near 0 makes them differences, and the fixed point the mode.
+        step: Longest step tried; the search halves it.
+        sufficient: Share of the decrease that the slope promises which a step must reach.
+        temperature: 0 takes the first step that reaches it. Above, in units of T, every acceptance
+            is a sigmoid and the step their mean, which has a gradient.
+    """
+
+    spread: Array | float = 1.0
+    step: Array | float = 1.0
+    sufficient: Array | float = 1e-4
+    temperature: Array | float = 0.0
+
+
+class _Slope(NamedTuple):
+    """The observation about an iterate, in whitened coordinates; masked channels are zero.
+
+    Attributes:
+        innovation: ``(m,)`` what is to be explained by the state and its noise.
+        A: ``(m, n)`` derivative with respect to the state.
+        G: ``(m, k)`` derivative with respect to the noise in the state; k is 0 if it is not there.
+        R: ``(m, m)`` covariance of the noise.
+        spread_noise: ``(m, m)`` what the linearisation leaves unexplained.
+    """
+
+    innovation: Array
+    A: Array
+    G: Array
+    R: Array
+    spread_noise: Array
+
+
+class _Step(NamedTuple):
+    """What an iteration leaves: the slope, the factor of ``S``, the whitened gain ``(n, m)``."""
+
+    slope: _Slope
+    S: Array
+    root: Cholesky
+    gain: Array
+    moved: Array
+
+
+class _Problem(NamedTuple):
+    """One update in whitened coordinates ``(d,)``: the state's, then those of augmented noise.
+
+    Attributes:
+        predicted: ``(point) -> (m,)`` observation.
+        noise: ``(m, m)`` or ``(m,)`` covariance of the noise that adds.
+        states: Number ``n`` of coordinates of the state.
+        size: Number ``d`` of all coordinates.
+    """
+
+    predicted: Callable[[Array], Array]
+    noise: Array
+    states: int
+    size: int
+
+
+class _Form(NamedTuple):
+    """What tells the filters apart.
+
+    Attributes:
+        base: The filter whose ``init`` and ``predict`` are used.
+        mended: ``(state) -> bool`` whether a covariance was mended in making the state.
+        rebuilt: ``(x, P) -> state``.
+        problem: ``(model, params, x, L, u) -> _Problem``.
+        slope: ``(model, problem, obs, point, search) -> (residual's mean, slope, spread noise)``.
+    """
+
+    base: Filter
+    mended: Callable[[Any], Array]
+    rebuilt: Callable[[Point, Array], Any]
+    problem: Callable[[Model, Params, Point, Array, Input], _Problem]
+    slope: Callable[[Model, _Problem, Obs, Array, Search], tuple[Array, Array, Array]]
+
+
+def iterated_ekf(
+    model: Model, *, iterations: int = 3, trials: int = 6, search: Search | None = None
+) -> Filter:
+    """Return the iterated extended Kalman filter, with parameters :class:`FilterParams`.
+
+    Prediction, masks and flags are those of :func:`~jaxnav.estimation.filters.kalman.ekf`; the
+    update is that of :func:`iterated_ckf` with the derivative at the iterate, always automatic, in
+    place of cubature points. Its fixed point is the mode of the posterior.
+
+    Arguments and errors are those of :func:`iterated_ckf`; ``spread`` is not used.
+
+    References:
+        Bell and Cathey (1993), IEEE Trans. Automatic Control 38(2).
+    """
+    base = ekf(model)
+    form = _Form(base, lambda state: jnp.array(False), KalmanState, _additive, _derivative)
+    return _iterated(model, form, iterations, trials, search, printed=False)
+
+
+def iterated_ckf(
+    model: Model,
+    *,
+    iterations: int = 3,
+    trials: int = 6,
+    search: Search | None = None,
+    printed: bool = False,
+) -> Filter:
+    """Return the iterated cubature Kalman filter, with parameters :class:`FilterParams`.
+
+    Prediction is that of :func:`~jaxnav.estimation.filters.sigma_point.ckf`. Each iteration draws
+    points about the iterate with the spread of the prior, and takes from them the slope ``A``, the
+    mean of the observation, and the scatter that the slope leaves unexplained, which joins ``R`` in
+    ``S``; so one full step is the update of the ``ckf``. With the full spread the fixed point
+    differs from the mode by that linearisation. The covariance is updated once, with the gain of
+    the last iteration, in Joseph form.
+
+    The number of iterations is fixed, so that gradients and ``vmap`` work. A search guards them:
+    a step that does not lower ``T`` enough is halved, and where none does the iterate stays.
+    ``FilterParams.search`` overrides the numbers of the search as leaves. ``Info`` holds the
+    innovation and likelihood of the prediction, and the number of steps that were accepted.
+
+    Args:
+        model: The model.
+        iterations: Number of Gauss-Newton steps, at least one.
+        trials: Number of step lengths that the search tries; 0 takes ``search.step`` unseen.
+        search: Numbers of the search.
+        printed: Iterate as Eqs. (20)-(26) print it: linearised at the prior in every iteration, the
+            sign of ``X_j - X-`` reversed, and no search. It diverges from the second iteration on.
+
+    Raises:
+        ValueError: If ``iterations`` is below 1 or ``trials`` below 0; in a run, if shapes do not
+            fit together.
+
+    References:
+        Shi, Chen, Wang (2023), Eqs. (9)-(28). The functional (10) is printed with ``P_zz`` and the
+        predicted observation, of which its first terms do not depend on the state; (12) likewise;
+        (13) and (26) have the wrong sign, and an innovation that is not made anew. All are put
+        right here. Arasaratnam and Haykin (2009) for the rule.
+    """
+    form = _Form(ckf(model), _sigma_mended, _sigma_state, _additive, _cubature)
+    return _iterated(model, form, iterations, trials, search, printed)
+
+
+def modified_iterated_ckf(
+    model: Model,
+    *,
+    iterations: int = 3,
+    trials: int = 6,
+    search: Search | None = None,
+    printed: bool = False,
+) -> Filter:
+    """Return the iterated cubature filter whose state is augmented with the observation's noise.
+
+    The points are drawn about the iterate of state and noise together, through
+    :attr:`Model.noisy`; ``R`` is part of the augmented covariance and enters nowhere else. For
+    noise that only adds, the noise cancels from every step and the filter is :func:`iterated_ckf`
+    but for the spread of its points; it then has that filter's fixed point in the limit of no
+    spread. Noise that enters ``h`` otherwise is iterated on with the state.
+
+    Arguments and errors are those of :func:`iterated_ckf`.
+
+    References:
+        Shi, Chen, Wang (2023), Eqs. (19)-(28), with the sizes of (19)-(20) put right and without
+        the second ``R`` of (23).
+    """
+    form = _Form(ckf(model), _sigma_mended, _sigma_state, _augmented, _cubature)
+    return _iterated(model, form, iterations, trials, search, printed)
+
+
+def _iterated(
+    model: Model,
+    form: _Form,
+    iterations: int,
+    trials: int,
+    search: Search | None,
+    printed: bool,
+) -> Filter:
+    if iterations < 1 or trials < 0:
+        raise ValueError(
+            f"iterations = {iterations}, trials = {trials}; an iterated filter needs at least one "
+            "iteration and no negative number of trials"
+        )
+    built_with = Search() if search is None else search
+
+    def update(params: FilterParams, state: Any, u: Input, obs: Obs) -> tuple[Any, Info]:
+        rule = _search(params, built_with)
+        prior = form.base.estimate(state)
+        whitening = semidefinite_root(prior.cov)
+        L = whitening.factor
+        problem = form.problem(model, params.model, prior.mean, L, u)
+
+        def iterate(point: Array, _: None) -> tuple[Array, _Step]:
+            at = jnp.zeros_like(point) if printed else point
+            slope = _slope(model, form, problem, obs, at, rule)
+            moved, solved = _gauss_newton(problem, slope, point, printed)
+            length = rule.step
+            if trials and not printed:
+                length = _search_length(model, problem, obs, slope, point, moved, rule, trials)
+            length = jnp.where(solved.root.positive_definite, length, 0)
+            return point + length * moved, solved._replace(moved=length > 0)
+
+        point, steps = jax.lax.scan(
+            iterate, jnp.zeros(problem.size, L.dtype), None, length=iterations
+        )
+        first, last = (jax.tree.map(lambda leaf, i=i: leaf[i], steps) for i in (0, -1))
+        left = jnp.eye(problem.states, dtype=L.dtype) - last.gain @ last.slope.A
+        noise = last.slope.R + last.slope.spread_noise
+        whitened = left @ left.T + last.gain @ noise @ last.gain.T
+        x = model.retract(prior.mean, L @ point[: problem.states])
+        mended = form.mended(state) | ~whitening.semidefinite
+        info = innovation_info(first.slope.innovation, first.S, first.root, obs.valid, mended)
+        taken = jnp.sum(steps.moved).astype(jnp.int32)
+        return form.rebuilt(x, symmetrise(L @ whitened @ L.T)), info._replace(iterations=taken)
+
+    return form.base._replace(update=update)
+
+
+def _search(params: FilterParams, built_with: Search) -> Search:
+    if isinstance(params.search, Search):
+        return params.search
+    if not isinstance(params.search, tuple) or params.search:
+        raise ValueError(
+            f"search is a {type(params.search).__name__}; it must be a Search, or () for the one "
+            "that the filter was built with"
+        )
+    return built_with
+
+
+def _sigma_mended(state: SigmaPointState) -> Array:
+    return state.indefinite
+
+
+def _sigma_state(x: Point, P: Array) -> SigmaPointState:
+    return SigmaPointState(x, P, (), jnp.array(False))
+
+
+def _additive(model: Model, params: Params, x: Point, L: Array, u: Input) -> _Problem:
+    """Return the update over the state alone."""
+    n = L.shape[0]
+    R = model.observation_noise(params, x, u)
+    return _Problem(lambda at: model.observe(params, model.retract(x, L @ at), u), R, n, n)
+
+
+def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input) -> _Problem:
+    """Return the update over the state and the noise of its observation."""
+    n = L.shape[0]
+    noisy = model.noisy if model.noisy is not None else _with_added_noise(model)
+    given = noisy.noise(params, x, u)
+    root = jnp.diag(jnp.sqrt(given)) if given.ndim == 1 else semidefinite_root(given).factor
+
+    def predicted(at: Array) -> Array:
+        return noisy.observe(params, model.retract(x, L @ at[:n]), root @ at[n:], u)
+
+    zero = jnp.zeros(jax.eval_shape(model.observe, params, x, u).shape, L.dtype)
+    return _Problem(predicted, zero, n, n + root.shape[0])
+
+
+def _with_added_noise(model: Model) -> NonAdditive:
+    return NonAdditive(
+        lambda params, x, v, u: model.observe(params, x, u) + v, model.observation_noise
+    )
+
+
+def _slope(
+    model: Model, form: _Form, problem: _Problem, obs: Obs, point: Array, search: Search
+) -> _Slope:
+    """Linearise the observation about a point ``(d,)``, masked."""
+    n = problem.states
+    nu = masked_innovation(model, obs, problem.predicted(point))
+    mean, whole, spread_noise = form.slope(model, problem, obs, point, search)
+    A, G = whole[:, :n], whole[:, n:]
+    added = jnp.diag(problem.noise) if problem.noise.ndim == 1 else problem.noise
+    R = mask_noise(added + G @ G.T, obs.valid)
+    return _Slope(nu - mean + G @ point[n:], A, G, R, spread_noise)
+
+
+def _cubature(
+    model: Model, problem: _Problem, obs: Obs, point: Array, search: Search
+) -> tuple[Array, Array, Array]:
+    """Statistical linearisation by the cubature rule, whose points lie on the axes."""
+    reach = search.spread * problem.size**0.5
+    offsets = reach * jnp.eye(problem.size, dtype=point.dtype)
+    reference = problem.predicted(point)
+
+    def seen(offset: Array) -> Array:
+        residual = model.residual(problem.predicted(point + offset), reference)
+        return jnp.where(obs.valid, residual, 0)
+
+    ahead, behind = jax.vmap(seen)(offsets), jax.vmap(seen)(-offsets)
+    even = 0.5 * (ahead + behind)
+    mean = jnp.mean(even, axis=0)
+    scatter = even - mean[None]
+    return mean, (ahead - behind).T / (2 * reach), scatter.T @ scatter / problem.size
+
+
+def _derivative(
+    model: Model, problem: _Problem, obs: Obs, point: Array, search: Search
+) -> tuple[Array, Array, Array]:
+    """Linearisation by the derivative."""
+    del search
+    reference = problem.predicted(point)
+
+    def seen(at: Array) -> Array:
+        return jnp.where(obs.valid, model.residual(problem.predicted(at), reference), 0)
+
+    m = obs.valid.shape[0]
+    return jnp.zeros(m, point.dtype), jax.jacfwd(seen)(point), jnp.zeros((m, m), point.dtype)
+
+
+def _gauss_newton(
+    problem: _Problem, slope: _Slope, point: Array, printed: bool
+) -> tuple[Array, _Step]:
+    """Return the full step ``(d,)`` from a point."""
+    S = symmetrise(slope.A @ slope.A.T) + slope.R + slope.spread_noise
+    root = cholesky(S)
+    state = point[: problem.states]
+    whole = jnp.concatenate([slope.A, slope.G], axis=1)
+    gain = solve_lower_transposed(root.factor, solve_lower(root.factor, whole)).T
+    gain = jnp.where(root.positive_definite, gain, 0)
+    target = gain @ (slope.innovation + slope.A @ state)
+    moved = target + point if printed else target - point
+    return moved, _Step(slope, S, root, gain[: problem.states], jnp.array(True))
+
+
+def _search_length(
+    model: Model,
+    problem: _Problem,
+    obs: Obs,
+    slope: _Slope,
+    point: Array,
+    moved: Array,
+    search: Search,
+    trials: int,
+) -> Array:
+    """Return the step length of a back-tracking search on the posterior's functional.
+
+    Noise in the state is held and its effect taken to first order, ``e(x) = z - h(x, v) + G v``
+    with covariance ``G G'``: the step is Gauss-Newton's on that functional too.
+    """
+    n = problem.states
+    root = cholesky(slope.R)
+    held = slope.G @ point[n:]
+
+    def functional(state: Array, misfit: Array) -> Array:
+        whitened = solve_lower(root.factor, misfit)
+        return jnp.sum(state * state) + jnp.sum(whitened * whitened)
+
+    def tried(length: Array) -> Array:
+        state = point[:n] + length * moved[:n]
+        seen = problem.predicted(jnp.concatenate([state, point[n:]]))
+        misfit = masked_innovation(model, obs, seen) + jnp.where(obs.valid, held, 0)
+        return functional(state, misfit)
+
+    lengths = search.step * 0.5 ** jnp.arange(trials, dtype=point.dtype)
+    start = tried(jnp.zeros((), point.dtype))
+    pull = solve_lower_transposed(root.factor, solve_lower(root.factor, slope.innovation))
+    gradient = 2 * (point[:n] - slope.A.T @ pull)
+    promised = jnp.minimum(gradient @ moved[:n], 0)
+    margin = start + search.sufficient * lengths * promised - jax.vmap(tried)(lengths)
+    known = jnp.isfinite(margin)
+    margin = jnp.where(known, margin, 0)
+    soft = jnp.asarray(search.temperature, point.dtype)
+    smooth = jax.nn.sigmoid(margin / jnp.where(soft > 0, soft, 1))
+    accepted = jnp.where(soft > 0, smooth, (margin >= 0).astype(point.dtype))
+    accepted = jnp.where(known, accepted, 0)
+    refused = jnp.concatenate([jnp.ones(1, point.dtype), jnp.cumprod(1 - accepted)[:-1]])
+    # Without noise there is no functional to search on.
+    return jnp.where(root.positive_definite, jnp.sum(refused * accepted * lengths), search.step)
