@@ -3,7 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-from jaxnav.estimation.types import Filter, Input, Obs, Params
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.filters.innovation import masked_innovation
+from jaxnav.estimation.filters.kalman import KalmanState, ekf, kf
+from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs, Params, Point
 
 
 def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filter:
@@ -27,3 +33,65 @@ def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filte
         return filter.update(informed(params, u), state, u, obs)
 
     return filter._replace(predict=predict, update=update)
+
+
+def linearised_at_truth(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> Filter:
+    """Return the Kalman filter of a nonlinear model linearised at the true states.
+
+    With additive Gaussian noise its covariance is the posterior Cramer-Rao bound along that
+    trajectory, and its error reaches it: what is left to a filter that has to linearise elsewhere
+    is to come close. Parameters, masks and flags are those of the
+    :func:`~jaxnav.estimation.filters.kalman.ekf`.
+
+    Args:
+        model: The model.
+        truth: ``(u) -> (x, y)`` the true states at the start and the end of the step, which the
+            input carries.
+
+    References:
+        Taylor (1979), IEEE Trans. Automatic Control 24(2); Tichavsky, Muravchik, Nehorai (1998),
+        IEEE Trans. Signal Processing 46(5).
+    """
+
+    def transition(params: Params, dx: Array, u: Input) -> Array:
+        before, after = truth(u)
+
+        def moved(dx: Array) -> Array:
+            return model.local(after, model.transition(params, model.retract(before, dx), u))
+
+        start, change = jax.jvp(moved, (jnp.zeros_like(dx),), (dx,))
+        return start + change
+
+    def observe(params: Params, dx: Array, u: Input) -> Array:
+        _, after = truth(u)
+        z = model.observe(params, after, u)
+
+        def seen(dx: Array) -> Array:
+            return model.residual(model.observe(params, model.retract(after, dx), u), z)
+
+        return jax.jvp(seen, (jnp.zeros_like(dx),), (dx,))[1]
+
+    errors = kf(
+        Model(
+            transition,
+            lambda params, dx, u: model.process_noise(params, truth(u)[0], u),
+            observe,
+            lambda params, dx, u: model.observation_noise(params, truth(u)[1], u),
+        )
+    )
+
+    def predict(params: FilterParams, state: KalmanState, u: Input) -> KalmanState:
+        before, after = truth(u)
+        error = errors.predict(params, KalmanState(model.local(before, state.x), state.P), u)
+        return KalmanState(model.retract(after, error.x), error.P)
+
+    def update(
+        params: FilterParams, state: KalmanState, u: Input, obs: Obs
+    ) -> tuple[KalmanState, Info]:
+        _, after = truth(u)
+        nu = masked_innovation(model, obs, model.observe(params.model, after, u))
+        at = KalmanState(model.local(after, state.x), state.P)
+        error, info = errors.update(params, at, u, Obs(nu, obs.valid))
+        return KalmanState(model.retract(after, error.x), error.P), info
+
+    return ekf(model)._replace(predict=predict, update=update)
