@@ -2,7 +2,9 @@
 
 A batched ``dot`` of 3x3 blocks and a LAPACK call per step each cost more than the arithmetic of a
 whole Kalman step, so the sizes a navigation filter meets (three axes, up to six measurements) are
-written out as multiply-adds over Python loops that unroll at trace time.
+written out as multiply-adds over Python loops that unroll at trace time. Above that a loop takes a
+matrix apart column by column: batched LAPACK calls share the threads that they are called from, and
+a large batch of them can stall for good (jax 0.10.2 on two cores).
 """
 
 from collections.abc import Callable
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 UNROLL_LIMIT = 6
-"""Largest size that is unrolled; above it the general routines of JAX take over."""
+"""Largest size that is unrolled; above it a product is a ``dot`` and a factorisation a loop."""
 
 
 def symmetrise(A: Array) -> Array:
@@ -72,7 +74,7 @@ def cholesky(S: Array) -> Cholesky:
     """
     m = S.shape[0]
     if m > UNROLL_LIMIT:
-        return _lapack_cholesky(S)
+        return _rolled_cholesky(S)
     L: list[list[Array]] = []
     positive = jnp.array(True)
     ratio = jnp.ones((), S.dtype)
@@ -91,12 +93,19 @@ def cholesky(S: Array) -> Cholesky:
     return Cholesky(jnp.where(positive, factor, jnp.eye(m, dtype=S.dtype)), positive, ratio)
 
 
-def _lapack_cholesky(S: Array) -> Cholesky:
-    trial = jax.lax.stop_gradient(jnp.linalg.cholesky(S))
-    positive = jnp.all(jnp.isfinite(trial))
-    factor = jnp.linalg.cholesky(jnp.where(positive, S, jnp.eye(S.shape[0], dtype=S.dtype)))
-    ratio = jnp.min(jnp.diag(factor) ** 2 / jnp.where(positive, jnp.diag(S), 1))
-    return Cholesky(factor, positive, jnp.where(positive, ratio, 0))
+def _rolled_cholesky(S: Array) -> Cholesky:
+    def eliminate(rest: Array) -> tuple[Array, tuple[Array, Array]]:
+        pivot = rest[0, 0]
+        column = rest[:, 0] / jnp.sqrt(jnp.where(pivot > 0, pivot, 1))
+        return (rest - column[:, None] * column[None])[1:, 1:], (pivot, column)
+
+    # A matrix that fails is taken apart again as the identity, whose derivative is finite.
+    one = jnp.eye(S.shape[0], dtype=S.dtype)
+    failed = ~jnp.all(jnp.stack(_by_columns(eliminate, jax.lax.stop_gradient(S))[0]) > 0)
+    sound = jnp.where(failed, one, S)
+    numbers, columns = _by_columns(eliminate, sound)
+    ratio = jnp.min(jnp.stack(numbers) / jnp.diag(sound))
+    return Cholesky(_lower(columns), ~failed, jnp.where(failed, 0, ratio))
 
 
 def _dot(a: list[Array], b: list[Array]) -> Array | int:
@@ -107,7 +116,7 @@ def solve_lower(L: Array, B: Array) -> Array:
     """Return ``inv(L) B`` by substitution; lower ``L`` ``(m, m)``, ``B`` ``(m, n)`` or ``(m,)``."""
     m = L.shape[0]
     if m > UNROLL_LIMIT:
-        return jax.scipy.linalg.solve_triangular(L, B, lower=True)
+        return _rolled_solve(L, B)
     rows: list[Array] = []
     for i in range(m):
         rows.append((B[i] - sum(L[i, j] * rows[j] for j in range(i))) / L[i, i])
@@ -118,11 +127,23 @@ def solve_lower_transposed(L: Array, B: Array) -> Array:
     """Return ``inv(L') B`` by back substitution; shapes as in :func:`solve_lower`."""
     m = L.shape[0]
     if m > UNROLL_LIMIT:
-        return jax.scipy.linalg.solve_triangular(L.T, B, lower=False)
+        return _rolled_solve(L.T[::-1, ::-1], B[::-1])[::-1]
     rows: dict[int, Array] = {}
     for i in reversed(range(m)):
         rows[i] = (B[i] - sum(L[j, i] * rows[j] for j in range(i + 1, m))) / L[i, i]
     return jnp.stack([rows[i] for i in range(m)])
+
+
+def _rolled_solve(L: Array, B: Array) -> Array:
+    m = L.shape[0]
+    columns = jnp.stack([jnp.pad(L[j:, j], (0, j)) for j in range(m)])
+
+    def eliminate(rest: Array, column: Array) -> tuple[Array, Array]:
+        row = rest[0] / column[0]
+        left = rest - (column[:, None] * row[None] if rest.ndim == 2 else column * row)
+        return jnp.concatenate([left[1:], jnp.zeros_like(left[:1])]), row
+
+    return jax.lax.scan(eliminate, B, columns)[1]
 
 
 def log_det(L: Array) -> Array:
