@@ -31,6 +31,10 @@ COLOURS = {
     "mmae-ukf": "tab:olive",
     "immae-ukf": "tab:blue",
     "imm-ukf": "tab:purple",
+    "conventional": "tab:red",
+    "ckf": "tab:pink",
+    "iterated-ckf": "tab:blue",
+    "modified-iterated-ckf": "tab:green",
     "oracle": "black",
 }
 """Colour of each method, the same in all figures."""

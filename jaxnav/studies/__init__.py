@@ -50,6 +50,14 @@ STUDIES = {
         scenarios="jaxnav.studies.mmae_ukf.config:SCENARIOS",
         check="jaxnav.studies.base:check_simulated",
     ),
+    "rkcns": Study(
+        summary="SINS aided by starlight refraction, iterated cubature filters (Shi, Chen, Wang)",
+        config="jaxnav.studies.rkcns.config:RkcnsConfig",
+        entry="jaxnav.studies.rkcns.study:run_study",
+        figures="jaxnav.studies.rkcns.figures:draw",
+        scenarios="jaxnav.studies.rkcns.config:SCENARIOS",
+        check="jaxnav.studies.rkcns.study:check",
+    ),
     "gnss-track": Study(
         summary="a recorded GNSS track through the same bank, judged by predictive likelihood",
         config="jaxnav.studies.gnss_track.config:GnssTrackConfig",

@@ -1,18 +1,15 @@
 """What a step of each method costs on its own, since the paper names the price of its bank."""
 
-import time
 from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
 
 from jaxnav.estimation.banks.imm import imm
 from jaxnav.estimation.banks.mixture import BankParams, immae, mmae
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf
-from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, Obs
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
 from jaxnav.studies.mmae_ukf.methods import (
@@ -25,11 +22,8 @@ from jaxnav.studies.mmae_ukf.methods import (
     shared_of,
     started,
 )
-from jaxnav.studies.mmae_ukf.simulation import Run, build_world, fly
-
-RUNS = 16
-STEPS = 200
-REPEATS = 3
+from jaxnav.studies.mmae_ukf.simulation import build_world, fly
+from jaxnav.studies.timing import RUNS, microseconds_per_step
 
 
 @cache
@@ -49,26 +43,21 @@ def alone(setup: Setup) -> dict[str, Filter]:
 
 
 def step_costs(config: MmaeUkfConfig) -> dict[str, float]:
-    """Time each method over 16 runs at once on one device, compilation apart.
-
-    Returns:
-        Microseconds per filter step and run, the best of three.
-    """
+    """Return the time of each method by itself [us per filter step and run]."""
     world, setup = build_world(config), setup_of(config)
     shared = shared_of(config, world)
     keys = jax.random.split(jax.random.key(config.seed), RUNS)
-    simulate = jax.jit(
+    flights = jax.jit(
         jax.vmap(lambda key: fly(key, world, setup.period, setup.imu_step, setup.star))
-    )
-    flights = simulate(keys)
-    steps = min(STEPS, config.steps)
-    flights = flights._replace(
-        inputs=jax.tree.map(lambda leaf: leaf[:, :steps], flights.inputs), z=flights.z[:, :steps]
-    )
-    costs = {
-        name: _timed(filter, _params(name, shared, config.models), flights)
-        for name, filter in alone(setup).items()
-    }
+    )(keys)
+    observations = Obs(flights.z, jnp.ones(flights.z.shape, bool))
+
+    def timed(name: str, filter: Filter) -> float:
+        own = _params(name, shared, config.models)
+        params = jax.vmap(lambda start: started(own, start))(flights.start)
+        return microseconds_per_step(filter, params, flights.inputs, observations)
+
+    costs = {name: timed(name, filter) for name, filter in alone(setup).items()}
     return {**costs, "oracle": costs["ukf"]}
 
 
@@ -80,26 +69,3 @@ def _params(name: str, shared: Shared, models: int) -> Any:
         return jax.tree.map(lambda leaf: leaf[models], whole.members)
     members = jax.tree.map(lambda leaf: leaf[:models], whole.members)
     return BankParams(members, whole.rule if name == "imm-ukf" else whole.rule[name])
-
-
-def _timed(filter: Filter, params: Any, flights: Run) -> float:
-    """Return the time per step and run [us]."""
-
-    def one(flight: Run) -> Array:
-        observations = Obs(flight.z, jnp.ones(flight.z.shape, bool))
-        final = run(
-            filter,
-            started(params, flight.start),
-            flight.inputs,
-            observations,
-            record=lambda state, info: info.log_likelihood,
-        )
-        return final.record
-
-    compiled = jax.jit(jax.vmap(one)).lower(flights).compile()
-    best = float("inf")
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        jax.block_until_ready(compiled(flights))
-        best = min(best, time.perf_counter() - begin)
-    return 1e6 * best / (flights.z.shape[0] * flights.z.shape[1])

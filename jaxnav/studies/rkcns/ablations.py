@@ -1,0 +1,108 @@
+"""Variations of the study: how many stars, how high, how well the atmosphere is known."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxnav.estimation.metrics import Measured, rmse
+from jaxnav.estimation.montecarlo import Campaign, monte_carlo
+from jaxnav.studies.rkcns.config import RkcnsConfig
+from jaxnav.studies.rkcns.methods import run_one, setup_of, shared_of
+from jaxnav.studies.rkcns.simulation import build_world
+
+ITERATED = ("ckf", "iterated-ckf", "modified-iterated-ckf")
+
+
+class Variation(NamedTuple):
+    """A change of the configuration, and the methods that are run with it."""
+
+    label: str
+    changes: dict[str, Any]
+    methods: tuple[str, ...] = ("ckf",)
+    printed: bool = False
+
+
+class Outcome(NamedTuple):
+    """The position error over the flight that a method had in a variation.
+
+    Attributes:
+        label: Name of the variation.
+        method: Name of the method.
+        position: RMSE of the norm of the position error [m].
+        anees: Mean over time and runs of the NEES of the 15 states.
+        lost: Runs whose errors did not stay finite.
+    """
+
+    label: str
+    method: str
+    position: Measured
+    anees: float
+    lost: int
+
+
+LINEAR = (
+    Variation("constraint alone", {"stars": 0}),
+    Variation("1 star", {"stars": 1}),
+    Variation("5 stars", {"stars": 5}),
+    Variation("near 20 km", {"tangent_km": (19.0, 21.0)}),
+    Variation("near 25 km", {"tangent_km": (24.0, 26.0)}),
+    Variation("near 40 km", {"tangent_km": (38.0, 42.0)}, ITERATED),
+    Variation("rays as angles", {}, ("angle-ckf",)),
+    Variation("density 1 %", {"density_error": 0.01}),
+    Variation("printed constants", {"atmosphere": "printed"}),
+    Variation("printed iteration", {}, ("iterated-ckf",), printed=True),
+)
+NONLINEAR = (
+    Variation("full spread", {"point_spread": 1.0}, ITERATED[1:]),
+    Variation("one iteration", {"iterations": 1}, ITERATED[1:]),
+    Variation("no search", {"trials": 0}, ITERATED[1:]),
+    Variation("50 km, 3 arcsec", {"refraction_noise_arcsec": 3.0}, ITERATED),
+)
+
+
+def variations(config: RkcnsConfig) -> tuple[Variation, ...]:
+    """Return the variations of a scenario."""
+    return NONLINEAR if config.scenario == "strong-nonlinearity" else LINEAR
+
+
+def run_campaign(
+    config: RkcnsConfig, methods: tuple[str, ...], *, printed: bool = False, **options: Any
+) -> Campaign:
+    """Run the Monte Carlo of one scenario; options are those of ``monte_carlo``."""
+    shared = shared_of(config, build_world(config))
+    one = run_one(setup_of(config, methods, printed=printed))
+    return monte_carlo(one, jax.random.key(config.seed), config.runs, shared, **options)
+
+
+def run_ablations(
+    config: RkcnsConfig, progress: Callable[[int, int], None] | None = None
+) -> list[Outcome]:
+    """Run every variation over the same keys as the study.
+
+    Args:
+        config: The configuration of the scenario.
+        progress: Called with (variations done, variations).
+    """
+    outcomes: list[Outcome] = []
+    chosen = variations(config)
+    for done, change in enumerate(chosen, start=1):
+        varied = replace(config, **change.changes)
+        campaign = run_campaign(varied, change.methods, printed=change.printed)
+        for j, name in enumerate(change.methods):
+            square = campaign.rows.mean_square[:, j, :3].sum(axis=-1)
+            finite = np.isfinite(square)
+            outcomes.append(
+                Outcome(
+                    change.label,
+                    name,
+                    rmse(square[finite]) if finite.any() else Measured(np.inf, np.nan),
+                    float(np.mean(campaign.rows.nees[:, j])),
+                    int(np.sum(~finite)),
+                )
+            )
+        if progress is not None:
+            progress(done, len(chosen))
+    return outcomes
