@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from jaxnav.datasets import DataError
+from jaxnav.datasets.base import DataError
 from jaxnav.studies import STUDIES
 from jaxnav.studies.base import ConfigError, StudyResult
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxnav.datasets import DataError, GnssTrack, gaps, intervals_s, load_rtklib_pos, thin
+from jaxnav.datasets.base import DataError
+from jaxnav.datasets.rtklib import GnssTrack, gaps, intervals_s, load_rtklib_pos, thin
 
 REAL_FILE = (
     Path(__file__).resolve().parents[2] / "shared" / "data" / "rtk_drive" / "gnss_1934_sf.pos"

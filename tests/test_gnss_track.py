@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxnav.datasets import DataError
+from jaxnav.datasets.base import DataError
 from jaxnav.studies.base import ConfigError
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
 from jaxnav.studies.gnss_track.study import run_study

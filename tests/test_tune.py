@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from jaxnav.datasets import load_rtklib_pos
+from jaxnav.datasets.rtklib import load_rtklib_pos
 from jaxnav.estimation.tune import POSITIVE, UNIT, fit
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
 from jaxnav.studies.gnss_track.study import track_data

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxnav.datasets import DataError, GnssTrack, gaps, intervals_s, load_rtklib_pos, thin
+from jaxnav.datasets.base import DataError
+from jaxnav.datasets.rtklib import GnssTrack, gaps, intervals_s, load_rtklib_pos, thin
 from jaxnav.estimation.banks.mixture import BankParams, panel
 from jaxnav.estimation.banks.weights import (
     WindowedReset,

@@ -1,4 +1,4 @@
-"""Recorded logs as plain containers.
+"""RTKLIB's solution files as plain containers.
 
 Times are integer nanoseconds of GPS time since 1970-01-01 00:00:00 on the GPS calendar (no leap
 seconds), the count that RTKLIB's own time tags use. Malformed input raises `DataError`.
@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from jaxnav.datasets.base import DataError, number, read_text
 
 _EPOCH = datetime(1970, 1, 1)
 _GPS_EPOCH = datetime(1980, 1, 6)
@@ -29,10 +31,6 @@ _BY_COUNT = {15: _PLAIN, 24: (*_PLAIN, *_VELOCITY, *_VELOCITY_SIGMA, "sdvne", "s
 _RANGES = {"latitude(deg)": (-90, 90), "longitude(deg)": (-180, 360), "Q": (0, 9)} | dict.fromkeys(
     (*_REQUIRED[4:], *_VELOCITY_SIGMA), (0, math.inf)
 )
-
-
-class DataError(ValueError):
-    """A recorded log that is malformed, or a request that the log cannot honour."""
 
 
 class GnssTrack(NamedTuple):
@@ -174,7 +172,9 @@ def _optional(epochs: list[_Epoch], *names: str) -> NDArray[np.float64] | None:
 def _read_epochs(path: Path) -> list[_Epoch]:
     """Parses the solution lines; times do not decrease, columns are the same in all lines."""
     names, epochs = (), []
-    for number, line in enumerate(_read_text(path).split("\n"), start=1):
+    for number, line in enumerate(
+        read_text(path, "a readable RTKLIB .pos file").split("\n"), start=1
+    ):
         fields = line.removeprefix("%").replace(",", " ").split()
         try:
             if line.startswith("%"):
@@ -185,19 +185,10 @@ def _read_epochs(path: Path) -> list[_Epoch]:
                 epochs.append(_parse_epoch(names, fields))
                 _check_order(epochs[-2:])
         except DataError as error:
-            raise DataError(f"{path}, line {number}: {error}") from None
+            raise DataError(f"{path}, line {count}: {error}") from None
     if not epochs:
         raise DataError(f"{path}: the file has no solution line; accepted is at least one")
     return epochs
-
-
-def _read_text(path: Path) -> str:
-    try:
-        # Comments may hold file names in any encoding; the solution itself is ASCII.
-        return path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise DataError(f"{path}: {reason}; accepted is a readable RTKLIB .pos file") from error
 
 
 def _header_names(fields: list[str]) -> tuple[str, ...]:
@@ -224,15 +215,7 @@ def _parse_epoch(names: tuple[str, ...], fields: list[str]) -> _Epoch:
 
 
 def _number(name: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise DataError(f"{name} is {text!r}; accepted is a finite decimal number")
-    low, high = _RANGES.get(name, (-math.inf, math.inf))
-    if not low <= value <= high:
-        raise DataError(f"{name} is {text}; accepted is a number from {low} to {high}")
+    value = number(name, text, *_RANGES.get(name, (-math.inf, math.inf)))
     if name == "Q" and not value.is_integer():
         raise DataError(f"{name} is {text}; accepted is a whole number")
     return value
