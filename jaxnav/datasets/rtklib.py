@@ -172,9 +172,8 @@ def _optional(epochs: list[_Epoch], *names: str) -> NDArray[np.float64] | None:
 def _read_epochs(path: Path) -> list[_Epoch]:
     """Parses the solution lines; times do not decrease, columns are the same in all lines."""
     names, epochs = (), []
-    for number, line in enumerate(
-        read_text(path, "a readable RTKLIB .pos file").split("\n"), start=1
-    ):
+    text = read_text(path, "a readable RTKLIB .pos file")
+    for count, line in enumerate(text.split("\n"), start=1):
         fields = line.removeprefix("%").replace(",", " ").split()
         try:
             if line.startswith("%"):
