@@ -35,6 +35,7 @@ COLOURS = {
     "ckf": "tab:pink",
     "iterated-ckf": "tab:blue",
     "modified-iterated-ckf": "tab:green",
+    "angle-ckf": "tab:orange",
     "oracle": "black",
 }
 """Colour of each method, the same in all figures."""

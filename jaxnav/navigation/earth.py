@@ -13,6 +13,8 @@ WGS84_F = 1 / 298.257223563
 """Flattening [-]."""
 WGS84_E2 = WGS84_F * (2 - WGS84_F)
 """First eccentricity squared [-]."""
+MEAN_RADIUS = 6.371e6
+"""Radius [m] of the spherical Earth that stands for the ellipsoid where its shape is no matter."""
 
 
 def meridian_radius(latitude: Array | float) -> Array:

@@ -42,7 +42,10 @@ def brighter(catalogue: StarCatalogue, magnitude: float) -> StarCatalogue:
             f"no star of the catalogue is as bright as magnitude {magnitude:g}; the brightest is "
             f"of {catalogue.magnitude.min():g}"
         )
-    return StarCatalogue(*(column[kept] for column in catalogue[:-1]), catalogue.epoch)
+    columns = {
+        name: column[kept] for name, column in catalogue._asdict().items() if name != "epoch"
+    }
+    return catalogue._replace(**columns)
 
 
 def directions(catalogue: StarCatalogue, year: float) -> Values:

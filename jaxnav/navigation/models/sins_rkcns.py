@@ -27,14 +27,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.types import Model, NonAdditive
-from jaxnav.navigation.atmosphere import (
-    HeightModel,
-    RefractionTable,
-    model_height,
-    ray_height,
-    seen_refraction,
-)
+from jaxnav.navigation.atmosphere import RefractionTable
 from jaxnav.navigation.earth import gravity_launch_inertial
+from jaxnav.navigation.limb import HeightModel, model_height, ray_height, seen_refraction
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import SinsTotal, local, retract
 from jaxnav.numerics.lie import so3_exp, so3_local, so3_log, so3_retract

@@ -1,11 +1,16 @@
 """What a step of each method costs: the paper's count of operations beside measured time."""
 
+from functools import partial
+
 import jax
 
 from jaxnav.studies.rkcns.config import RkcnsConfig
-from jaxnav.studies.rkcns.methods import METHODS, filters, problem_of, setup_of, shared_of
+from jaxnav.studies.rkcns.methods import filters, problem_of, setup_of, shared_of
 from jaxnav.studies.rkcns.simulation import build_world, fly_run
 from jaxnav.studies.timing import RUNS, microseconds_per_step
+
+TIMED = ("conventional", "ckf", "iterated-ckf", "modified-iterated-ckf")
+"""The paper's methods."""
 
 
 def step_costs(config: RkcnsConfig) -> dict[str, float]:
@@ -13,13 +18,13 @@ def step_costs(config: RkcnsConfig) -> dict[str, float]:
     setup = setup_of(config)
     shared = shared_of(config, build_world(config))
     keys = jax.random.split(jax.random.key(config.seed), RUNS)
+    flights = jax.jit(jax.vmap(partial(fly_run, world=shared.world, timing=setup.timing)))(keys)
 
-    def flights(name: str) -> tuple:
-        return jax.jit(
-            jax.vmap(lambda key: problem_of(name, fly_run(key, shared.world, setup.timing), shared))
-        )(keys)
+    def timed(name: str) -> float:
+        given = jax.jit(jax.vmap(lambda flight: problem_of(name, flight, shared)))(flights)
+        return microseconds_per_step(filters(setup)[name], *given)
 
-    return {name: microseconds_per_step(filters(setup)[name], *flights(name)) for name in METHODS}
+    return {name: timed(name) for name in TIMED}
 
 
 def flops(states: int, channels: int, iterations: int) -> dict[str, float]:

@@ -16,13 +16,9 @@ from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.montecarlo import RunOutput
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs
-from jaxnav.navigation.atmosphere import (
-    HeightModel,
-    RefractionTable,
-    exponential_model,
-    fitted_model,
-)
+from jaxnav.navigation.atmosphere import RefractionTable
 from jaxnav.navigation.earth import MEAN_RADIUS
+from jaxnav.navigation.limb import HeightModel, exponential_model, fitted_model
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsParams, sins_rkcns
 from jaxnav.navigation.models.sins_total import SinsTotal, local, sins_total
@@ -31,7 +27,13 @@ from jaxnav.studies.rkcns.config import RkcnsConfig
 from jaxnav.studies.rkcns.simulation import Run, Timing, World, fly_run, noise_of, timing_of
 from jaxnav.units import ARCSEC
 
-METHODS = ("conventional", "ckf", "iterated-ckf", "modified-iterated-ckf", "oracle")
+METHODS = (
+    "conventional",
+    "ckf",
+    "iterated-ckf",
+    "modified-iterated-ckf",
+    "oracle",
+)
 FIT_SIGMAS = 5.0
 """How far beyond the band of stars the model of the atmosphere is fitted, in noise of an angle."""
 LEAST_ANGLE = 0.3
@@ -128,8 +130,8 @@ def believed_atmosphere(config: RkcnsConfig, table: RefractionTable) -> HeightMo
     most = np.interp(low, heights, angles) + noise
     top = np.interp(high, heights, angles)
     least = max(top - noise, LEAST_ANGLE * top)
-    band = np.interp([-most, -least], -angles, heights)
-    return fitted_model(*map(float, band))
+    lowest, highest = np.interp([-most, -least], -angles, heights)
+    return fitted_model(float(lowest), float(highest))
 
 
 @cache

@@ -1,6 +1,7 @@
 """Flights of the study: the truth that all runs share, and one run as the filters see it."""
 
-from typing import Any, NamedTuple
+from functools import cache, partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,9 @@ from jaxnav.datasets.stars import load_stars
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, Obs
-from jaxnav.navigation.atmosphere import RefractionTable, seen_refraction, tabulate
+from jaxnav.navigation.atmosphere import RefractionTable, tabulate
 from jaxnav.navigation.earth import MEAN_RADIUS
+from jaxnav.navigation.limb import seen_refraction
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsInput, observations
 from jaxnav.navigation.models.sins_total import (
@@ -31,9 +33,12 @@ from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
 from jaxnav.studies.rkcns.config import RkcnsConfig
 from jaxnav.units import ARCSEC, DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, MICRO_G
 
+LEAST_SLOTS = 3
+"""Fewest places for stars in the observations: one program serves up to so many."""
+
 
 class Limb(NamedTuple):
-    """The refracted stars of each epoch, up to ``n`` of them.
+    """The refracted stars of each epoch, in ``n`` places.
 
     Attributes:
         star: ``(K, n, 3)`` true directions in launch-inertial axes.
@@ -151,7 +156,7 @@ def build_world(config: RkcnsConfig) -> World:
     every = config.samples_per_step
     samples = config.launch_samples + config.steps * every
     trajectory = fly(RocketProfile(), steps=samples, step=config.imu_step, radius=MEAN_RADIUS)
-    atmosphere = tabulate()
+    atmosphere = standard_atmosphere()
     epochs = trajectory.state.position[config.launch_samples + every :: every]
     return World(
         trajectory=trajectory,
@@ -176,19 +181,37 @@ def find_stars(config: RkcnsConfig, atmosphere: RefractionTable, positions: Arra
         config.latitude_deg * DEG, config.sidereal_deg * DEG, config.azimuth_deg * DEG
     )
     sky = jnp.asarray(directions(catalogue, config.year)) @ jnp.asarray(launch).T
-    magnitudes = jnp.asarray(catalogue.magnitude)
-    low, high = (1e3 * bound for bound in config.tangent_km)
-    camera = Camera(
-        jnp.array([0.0, 1.0, 0.0]), jnp.array(jnp.pi), jnp.array(config.magnitude_limit)
-    )
+    band = 1e3 * jnp.array(config.tangent_km)
+    slots = max(config.stars, LEAST_SLOTS)
+    limb = _choose(slots, atmosphere, sky, jnp.asarray(catalogue.magnitude), band, positions)
+    return limb._replace(seen=limb.seen & (jnp.arange(slots) < config.stars)[None])
 
-    def choose(position: Array) -> tuple[Array, Array, Array]:
+
+@partial(jax.jit, static_argnums=0)
+def _choose(
+    slots: int,
+    atmosphere: RefractionTable,
+    sky: Array,
+    magnitudes: Array,
+    band: Array,
+    positions: Array,
+) -> Limb:
+    """Choose stars at positions ``(K, 3)`` for a camera that sees all round."""
+    camera = Camera(jnp.array([0.0, 1.0, 0.0]), jnp.array(jnp.pi), jnp.max(magnitudes))
+
+    def choose(position: Array) -> Limb:
         centred = _from_centre(position)
         seen = view(atmosphere, centred, sky, magnitudes, camera)
-        index, found = pick(seen, centred, sky, magnitudes, low, high, config.stars)
-        return sky[index], found, seen.tangent_height[index]
+        index, found = pick(seen, centred, sky, magnitudes, band[0], band[1], slots)
+        return Limb(sky[index], found, seen.tangent_height[index])
 
-    return Limb(*jax.lax.map(choose, positions))
+    return jax.lax.map(choose, positions)
+
+
+@cache
+def standard_atmosphere() -> RefractionTable:
+    """Return the traced standard atmosphere, made once."""
+    return tabulate()
 
 
 def _from_centre(position: Array) -> Array:
@@ -213,22 +236,21 @@ def fly_run(key: Array, world: World, timing: Timing) -> Run:
     motion = world.trajectory
     errors = ImuErrors(world.noise.gyro_noise, world.noise.accel_noise, drift, bias)
     quiet = jnp.ones(motion.dtheta.shape[0], sigma.dtype)
-    sensed = corrupt(imu_key, errors, motion.dtheta, motion.dvel, timing.imu_step, quiet)
-    launch = [leaf[: timing.launch_samples] for leaf in sensed]
-    free = [leaf[timing.launch_samples :] for leaf in sensed]
-
-    start = _dead_reckoned(world, timing, launch, error0)
+    turns, gains = corrupt(imu_key, errors, motion.dtheta, motion.dvel, timing.imu_step, quiet)
+    launched = timing.launch_samples
+    start = _dead_reckoned(world, timing, turns[:launched], gains[:launched], error0)
+    turns, gains = turns[launched:], gains[launched:]
     every = round(timing.period / timing.imu_step)
-    truth = _truth(motion, timing.launch_samples, every, drift, bias)
+    truth = _truth(motion, launched, every, drift, bias)
     before, after = (jax.tree.map(lambda leaf, at=at: leaf[at], truth) for at in _ENDS)
-    dtheta, dvel = accumulate(*free, every)
+    dtheta, dvel = accumulate(turns, gains, every)
     steps = world.limb.seen.shape[0]
     density = 1 + world.density_error * jax.random.normal(density_key, (), sigma.dtype)
     angle = _bent(world, after.position, density)
     angle = measure(limb_key, angle, world.refraction_noise)
     tracker = observe_attitude(star_key, after.dcm, world.noise.star_noise)
     # The time average of the specific force, not in the axes of one instant: body axes turn.
-    output = jnp.mean(free[1].reshape(steps, every, 3), axis=1) / timing.imu_step
+    output = jnp.mean(gains.reshape(steps, every, 3), axis=1) / timing.imu_step
     z = jax.vmap(observations)(tracker, angle, output)
     both = jnp.ones((steps, 3), bool)
     return Run(
@@ -250,18 +272,21 @@ _ENDS = (slice(None, -1), slice(1, None))
 def _truth(motion: Trajectory, first: int, every: int, drift: Array, bias: Array) -> SinsTotal:
     """Return the true states ``(K + 1)`` from the start of the filters on."""
     at = jax.tree.map(lambda leaf: leaf[first::every], motion.state)
-    constant = [jnp.broadcast_to(value, at.velocity.shape) for value in (drift, bias)]
+    shape = at.velocity.shape
+    constant = jnp.broadcast_to(drift, shape), jnp.broadcast_to(bias, shape)
     return SinsTotal(at.dcm, at.velocity, at.position, *constant)
 
 
-def _dead_reckoned(world: World, timing: Timing, sensed: Any, error0: Array) -> Gaussian:
+def _dead_reckoned(
+    world: World, timing: Timing, turns: Array, gains: Array, error0: Array
+) -> Gaussian:
     """Return what integrating the inertial sensors from launch gives, with its covariance."""
     pad = jax.tree.map(lambda leaf: leaf[0], world.trajectory.state)
     none = jnp.zeros(3, error0.dtype)
     at_rest = SinsTotal(pad.dcm, pad.velocity, pad.position, none, none)
     believed = retract(at_rest, error0.at[LAYOUT.eps.start :].set(0))
     every = round(timing.launch_period / timing.imu_step)
-    dtheta, dvel = accumulate(*sensed, every)
+    dtheta, dvel = accumulate(turns, gains, every)
     steps = dtheta.shape[0]
     inputs = SinsTotalInput(dtheta, dvel, jnp.ones(steps, error0.dtype))
     unaided = ekf(sins_total(timing.launch_period, timing.imu_step, MEAN_RADIUS))

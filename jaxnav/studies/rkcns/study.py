@@ -14,7 +14,7 @@ from jaxnav.studies.rkcns import cost
 from jaxnav.studies.rkcns.ablations import Outcome, run_ablations, run_campaign
 from jaxnav.studies.rkcns.claims import COMPONENTS, POSITION, PUBLISHED, assess
 from jaxnav.studies.rkcns.config import SCENARIOS, RkcnsConfig
-from jaxnav.studies.rkcns.methods import METHODS, Row
+from jaxnav.studies.rkcns.methods import METHODS
 from jaxnav.studies.rkcns.simulation import Limb, build_world
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 
@@ -61,8 +61,9 @@ def check(config: RkcnsConfig) -> None:
 
 def _run_scenario(config: RkcnsConfig, progress: Callable[[int, int], None] | None) -> StudyResult:
     limb = build_world(config).limb
-    campaign = run_campaign(config, METHODS, keep=1, progress=progress)
-    costs = cost.step_costs(config) if config.cost else None
+    campaign = run_campaign(config, keep=1, progress=progress)
+    timed = config.cost and config.scenario == "listed"
+    costs = cost.step_costs(config) if timed else None
     outcomes = run_ablations(config) if config.ablations else []
     arrays, dims = _arrays(config, campaign, limb)
     if outcomes:
@@ -97,18 +98,18 @@ def _measures(
     counted = cost.flops(STATES, 6 + config.stars, config.iterations)
     for i, name in enumerate(METHODS):
         measures[name] = _measures_of(campaign.rows, i, config.star_noise_arcsec * ARCSEC)
-        if costs is not None:
+        if costs is not None and name in costs:
             measures[name]["us_per_step"] = round(costs[name], 3)
         if name in counted:
             measures[name]["flops"] = round(counted[name])
     return measures
 
 
-def _measures_of(rows: Row, method: int, star_noise: float) -> dict[str, Any]:
+def _measures_of(rows: Any, method: int, star_noise: float) -> dict[str, Any]:
     """Return the entry of one method in ``summary.json``.
 
     Args:
-        rows: Statistics of the runs.
+        rows: :class:`~jaxnav.studies.rkcns.methods.Row` with a leading axis of runs.
         method: Index of the method.
         star_noise: Standard deviation of the star tracker [rad].
     """
