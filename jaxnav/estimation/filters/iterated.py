@@ -91,13 +91,9 @@ class _Step(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """One update in whitened coordinates ``(d,)``: the state's, then those of augmented noise.
+    """One update in ``size`` whitened coordinates: the ``states``, then those of augmented noise.
 
-    Attributes:
-        predicted: ``(point) -> (m,)`` observation.
-        noise: ``(m, m)`` or ``(m,)`` covariance of the noise that adds.
-        states: Number ``n`` of coordinates of the state.
-        size: Number ``d`` of all coordinates.
+    ``predicted`` maps a point to the observation ``(m,)``, ``noise`` is the covariance that adds.
     """
 
     predicted: Callable[[Array], Array]
@@ -130,10 +126,8 @@ def iterated_ekf(
     """Return the iterated extended Kalman filter, with parameters :class:`FilterParams`.
 
     Prediction, masks and flags are those of :func:`~jaxnav.estimation.filters.kalman.ekf`; the
-    update is that of :func:`iterated_ckf` with the derivative at the iterate, always automatic, in
-    place of cubature points. Its fixed point is the mode of the posterior.
-
-    Arguments and errors are those of :func:`iterated_ckf`; ``spread`` is not used.
+    update is that of :func:`iterated_ckf`, with its arguments and errors, but for the derivative at
+    the iterate, always automatic, in place of points. Its fixed point is the posterior's mode.
 
     References:
         Bell and Cathey (1993), IEEE Trans. Automatic Control 38(2).
@@ -183,7 +177,7 @@ def iterated_ckf(
         (13) and (26) have the wrong sign, and an innovation that is not made anew. All are put
         right here. Arasaratnam and Haykin (2009) for the rule.
     """
-    form = _Form(ckf(model), _sigma_mended, _sigma_state, _additive, _cubature)
+    form = _Form(ckf(model), lambda state: state.indefinite, _sigma_state, _additive, _cubature)
     return _iterated(model, form, iterations, trials, search, printed)
 
 
@@ -209,7 +203,7 @@ def modified_iterated_ckf(
         Shi, Chen, Wang (2023), Eqs. (19)-(28), with the sizes of (19)-(20) put right and without
         the second ``R`` of (23).
     """
-    form = _Form(ckf(model), _sigma_mended, _sigma_state, _augmented, _cubature)
+    form = _Form(ckf(model), lambda state: state.indefinite, _sigma_state, _augmented, _cubature)
     return _iterated(model, form, iterations, trials, search, printed)
 
 
@@ -272,10 +266,6 @@ def _search(params: FilterParams, built_with: Search) -> Search:
     return built_with
 
 
-def _sigma_mended(state: SigmaPointState) -> Array:
-    return state.indefinite
-
-
 def _sigma_state(x: Point, P: Array) -> SigmaPointState:
     return SigmaPointState(x, P, (), jnp.array(False))
 
@@ -290,7 +280,9 @@ def _additive(model: Model, params: Params, x: Point, L: Array, u: Input) -> _Pr
 def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input) -> _Problem:
     """Return the update over the state and the noise of its observation."""
     n = L.shape[0]
-    noisy = model.noisy if model.noisy is not None else _with_added_noise(model)
+    noisy = model.noisy or NonAdditive(
+        lambda params, x, v, u: model.observe(params, x, u) + v, model.observation_noise
+    )
     given = noisy.noise(params, x, u)
     root = jnp.diag(jnp.sqrt(given)) if given.ndim == 1 else semidefinite_root(given).factor
 
@@ -299,12 +291,6 @@ def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input) -> _P
 
     zero = jnp.zeros(jax.eval_shape(model.observe, params, x, u).shape, L.dtype)
     return _Problem(predicted, zero, n, n + root.shape[0])
-
-
-def _with_added_noise(model: Model) -> NonAdditive:
-    return NonAdditive(
-        lambda params, x, v, u: model.observe(params, x, u) + v, model.observation_noise
-    )
 
 
 def _slope(
