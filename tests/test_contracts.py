@@ -20,6 +20,11 @@ from jaxnav.estimation.banks.weights import (
     markov,
 )
 from jaxnav.estimation.bounds import oracle
+from jaxnav.estimation.filters.iterated import (
+    iterated_ckf,
+    iterated_ekf,
+    modified_iterated_ckf,
+)
 from jaxnav.estimation.filters.kalman import ekf, kf
 from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
 from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
@@ -110,6 +115,9 @@ def _cases() -> dict[str, Case]:
         "ckf": ckf(dense_model()),
         "square_root_ukf": square_root_ukf(dense_model()),
         "square_root_ckf": square_root_ckf(dense_model()),
+        "iterated_ekf": iterated_ekf(dense_model()),
+        "iterated_ckf": iterated_ckf(dense_model()),
+        "modified_iterated_ckf": modified_iterated_ckf(dense_model()),
     }
     reset = WindowedReset(jnp.array(5.0), jnp.array(0.9), jnp.array(0.05))
     banks: dict[str, tuple[Filter, Any]] = {

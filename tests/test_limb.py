@@ -94,8 +94,8 @@ def test_a_ray_traced_as_a_curve_is_bent_as_much_and_seen_where_the_geometry_say
         half = -np.arctan2(way.y[2, -1], way.y[3, -1])
         angle = float(refraction_angle(height))
         np.testing.assert_allclose(2 * half, angle, rtol=2e-6)
-        # By symmetry the star is where the ray came from: the exit direction, turned twice half.
-        star = jnp.array([-np.sin(-half), -np.cos(half), 0.0])
+        # The way in mirrors the way out, so the star is where the ray came from.
+        star = jnp.array([-np.sin(half), -np.cos(half), 0.0])
         for x, y in way.y[:2].T:
             seen = ray_height(jnp.array([x, y, 0.0]), star, angle)
             np.testing.assert_allclose(seen, apparent_height(height), atol=0.05)

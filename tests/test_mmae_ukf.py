@@ -116,7 +116,7 @@ def test_run_is_made_once_per_shape() -> None:
     assert run_one(setup, 10) is run_one(setup_of(MmaeUkfConfig(seed=3)), 10)
 
 
-PAPER = MmaeUkfConfig(runs=60)
+PAPER = MmaeUkfConfig(runs=32)
 """Flights at full length, enough of them for every interval that is asserted here; the command line
 runs a hundred."""
 
@@ -171,7 +171,7 @@ def test_plain_bank_remembers_and_the_others_forget(paper: Campaign) -> None:
 
 @pytest.mark.slow
 def test_reversed_schedule() -> None:
-    judge_fading_and_oracle(run_campaign(MmaeUkfConfig(scenario="reversed", runs=30)))
+    judge_fading_and_oracle(run_campaign(MmaeUkfConfig(scenario="reversed", runs=20)))
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,9 @@ def table(source: Path, magnitude: float) -> str:
     """
     kept = sorted(row for row in read_rows(source, SOURCE_COLUMNS) if row[-1] <= magnitude)
     if not kept:
-        raise DataError(f"{source}: no star is of magnitude {magnitude:g}; accepted is a fainter")
+        raise DataError(
+            f"{source}: no star is as bright as magnitude {magnitude:g}; accepted is a fainter limit"
+        )
     lines = [
         ",".join(form.format(value) for form, value in zip(FORMATS, row, strict=True))
         for row in kept
@@ -52,17 +54,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=BUNDLED, help="file to write")
     given = parser.parse_args(arguments)
     try:
-        text = table(given.source, given.magnitude)
-        partial = given.out.with_name(f".{given.out.name}.{os.getpid()}.tmp")
-        try:
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(given.out)
-        finally:
-            partial.unlink(missing_ok=True)
-    except (DataError, OSError) as error:
+        _write(given.out, table(given.source, given.magnitude))
+    except DataError as error:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def _write(out: Path, text: str) -> None:
+    """Write a file whole or not at all; raise DataError if it cannot be written."""
+    partial = out.parent / f".{out.name}.{os.getpid()}.tmp"
+    try:
+        try:
+            partial.write_text(text, encoding="utf-8", newline="\n")
+            partial.replace(out)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise DataError(f"{out}: {reason}; accepted is a file that can be written") from error
 
 
 if __name__ == "__main__":

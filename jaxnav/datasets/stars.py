@@ -40,16 +40,10 @@ def load_stars(path: str | Path | None = None) -> StarCatalogue:
         DataError: If the file cannot be read, has other columns, a malformed or repeated line, or
             no star.
     """
-    source = BUNDLED if path is None else Path(path)
-    rows = read_rows(source)
-    hip = [int(row[0]) for row in rows]
-    if len(set(hip)) != len(hip):
-        seen: set[int] = set()
-        double = next(n for n in hip if n in seen or seen.add(n))
-        raise DataError(f"{source}: the star HIP {double} is there twice; accepted is once")
+    rows = read_rows(BUNDLED if path is None else Path(path))
     ra, dec, motion_ra, motion_dec, magnitude = np.array(rows)[:, 1:].T
     return StarCatalogue(
-        hip=np.array(hip),
+        hip=np.array([int(row[0]) for row in rows], dtype=np.int64),
         right_ascension=ra * DEG,
         declination=dec * DEG,
         motion_ra=motion_ra * MAS_PER_YEAR,
@@ -71,8 +65,10 @@ def read_rows(path: Path, columns: tuple[str, ...] = COLUMNS) -> list[list[float
     """
     places: list[int] | None = None
     width, rows = 0, []
-    text = read_text(path, "a table of stars with the columns " + ", ".join(columns))
-    for count, line in enumerate(text.splitlines(), start=1):
+    first: dict[float, int] = {}
+    accepted = "a table of stars in UTF-8 with the columns " + ", ".join(columns)
+    text = read_text(path, accepted, errors="strict")
+    for count, line in enumerate(text.split("\n"), start=1):
         if not line.strip() or line.startswith("#"):
             continue
         fields = [field.strip() for field in line.split(",")]
@@ -81,6 +77,7 @@ def read_rows(path: Path, columns: tuple[str, ...] = COLUMNS) -> list[list[float
                 places, width = _places(fields, columns), len(fields)
             else:
                 rows.append(_row(fields, places, width))
+                _check_once(first, rows[-1][0], count)
         except DataError as error:
             raise DataError(f"{path}, line {count}: {error}") from None
     if not rows:
@@ -108,3 +105,11 @@ def _row(fields: list[str], places: list[int], width: int) -> list[float]:
     if not row[0].is_integer():
         raise DataError(f"hip is {fields[places[0]]}; accepted is a whole number")
     return row
+
+
+def _check_once(first: dict[float, int], hip: float, line: int) -> None:
+    """Note the line on which a star is first found, and refuse a second one."""
+    if first.setdefault(hip, line) != line:
+        raise DataError(
+            f"the star HIP {hip:.0f} is there twice, first on line {first[hip]}; accepted is once"
+        )

@@ -124,7 +124,7 @@ def believed_atmosphere(config: RkcnsConfig, table: RefractionTable) -> HeightMo
     if config.atmosphere == "printed":
         return exponential_model()
     low, high = (1e3 * bound for bound in config.tangent_km)
-    heights = table.low + table.step * np.arange(table.log_angle.shape[0])
+    heights = float(table.low) + float(table.step) * np.arange(table.log_angle.shape[0])
     angles = np.exp(np.asarray(table.log_angle))
     noise = FIT_SIGMAS * config.refraction_noise * ARCSEC
     most = np.interp(low, heights, angles) + noise

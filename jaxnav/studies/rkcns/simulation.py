@@ -26,10 +26,11 @@ from jaxnav.navigation.models.sins_total import (
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
 from jaxnav.navigation.sensors.refraction import Camera, measure, pick, view
 from jaxnav.navigation.sensors.star import observe_attitude
-from jaxnav.navigation.stars import brighter, dcm_launch_icrs, directions
+from jaxnav.navigation.stars import StarCatalogue, brighter, dcm_launch_icrs, directions
 from jaxnav.navigation.strapdown import accumulate
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
+from jaxnav.studies.base import require
 from jaxnav.studies.rkcns.config import RkcnsConfig
 from jaxnav.units import ARCSEC, DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, MICRO_G
 
@@ -170,13 +171,27 @@ def build_world(config: RkcnsConfig) -> World:
     )
 
 
+def stars_of(config: RkcnsConfig) -> StarCatalogue:
+    """Return the stars that the sensors see.
+
+    Raises:
+        DataError: If the star table is missing or malformed.
+        ConfigError: If none is bright enough.
+    """
+    catalogue = load_stars(config.catalogue)
+    brightest = catalogue.magnitude.min()
+    limit = config.magnitude_limit
+    require(limit >= brightest, "magnitude_limit", limit, f"{brightest:g}, the brightest, or above")
+    return brighter(catalogue, limit)
+
+
 def find_stars(config: RkcnsConfig, atmosphere: RefractionTable, positions: Array) -> Limb:
     """Choose the refracted stars at true positions ``(K, 3) [m]`` from the launch point.
 
     Raises:
         DataError: If the star table is missing or malformed.
     """
-    catalogue = brighter(load_stars(config.catalogue), config.magnitude_limit)
+    catalogue = stars_of(config)
     launch = dcm_launch_icrs(
         config.latitude_deg * DEG, config.sidereal_deg * DEG, config.azimuth_deg * DEG
     )

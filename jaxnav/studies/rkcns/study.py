@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.datasets.stars import load_stars
 from jaxnav.estimation.metrics import chi2_mean_bounds, rmse
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.studies.attitude import AXES, DIVERGED_SIGMAS
@@ -15,7 +14,7 @@ from jaxnav.studies.rkcns.ablations import Outcome, run_ablations, run_campaign
 from jaxnav.studies.rkcns.claims import COMPONENTS, POSITION, PUBLISHED, assess
 from jaxnav.studies.rkcns.config import SCENARIOS, RkcnsConfig
 from jaxnav.studies.rkcns.methods import METHODS
-from jaxnav.studies.rkcns.simulation import Limb, build_world
+from jaxnav.studies.rkcns.simulation import Limb, build_world, stars_of
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 
 UNITS = {"m": 1.0, "arcsec": ARCSEC, "deg/h": DEG_PER_HOUR, "ug": MICRO_G}
@@ -52,11 +51,11 @@ def check(config: RkcnsConfig) -> None:
     """Raise what the study would refuse, before anything is written.
 
     Raises:
-        ConfigError: If 64-bit floats are off.
+        ConfigError: If 64-bit floats are off, or no star is bright enough.
         DataError: If the star table is missing or malformed.
     """
     check_simulated(config)
-    load_stars(config.catalogue)
+    stars_of(config)
 
 
 def _run_scenario(config: RkcnsConfig, progress: Callable[[int, int], None] | None) -> StudyResult:
