@@ -73,6 +73,9 @@ if TYPE_CHECKING:
     from jaxnav.estimation.banks.weights import (
         windowed_reset as windowed_reset,
     )
+    from jaxnav.estimation.bounds import (
+        linearised_at_truth as linearised_at_truth,
+    )
     from jaxnav.estimation.bounds import oracle as oracle
     from jaxnav.estimation.filters.iterated import (
         iterated_ckf as iterated_ckf,
@@ -148,7 +151,7 @@ _HOMES = {
         "markov",
         "windowed_reset",
     ),
-    "jaxnav.estimation.bounds": ("oracle",),
+    "jaxnav.estimation.bounds": ("linearised_at_truth", "oracle"),
     "jaxnav.estimation.filters.iterated": (
         "iterated_ckf",
         "iterated_ekf",

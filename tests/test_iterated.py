@@ -107,7 +107,7 @@ def test_one_full_step_is_the_cubature_filter() -> None:
     np.testing.assert_allclose(info.nis, told.nis, rtol=1e-10)
 
 
-def mode(prior: Gaussian, z: Array, start: Array) -> tuple[np.ndarray, float]:
+def mode(prior: Gaussian, z: Array, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the minimiser of the posterior functional, and its value, by another's hand."""
     inner = np.linalg.inv(np.linalg.cholesky(np.asarray(prior.cov)))
     outer = np.linalg.inv(np.linalg.cholesky(np.asarray(SPREAD_NOISE)))

@@ -103,7 +103,7 @@ def test_the_vehicle_falls_freely_and_the_gyros_less_their_drift_turn_it() -> No
 def test_the_process_noise_is_that_of_white_rates_and_accelerations() -> None:
     p, s = params(), LAYOUT
     Q = np.asarray(HEIGHTS.process_noise(p, state(), seen(state())))
-    gyro = p.gyro_noise[0] ** 2 * PERIOD * IMU_STEP
+    gyro = float(p.gyro_noise[0] ** 2 * PERIOD * IMU_STEP)
     np.testing.assert_allclose(Q[s.phi, s.phi], gyro * np.eye(3), atol=1e-12 * gyro)
     pushed = p.disturbance**2
     for rows, columns, factor in ((s.dv, s.dv, 1.0), (s.dv, s.dr, 0.5), (s.dr, s.dr, 1 / 3)):

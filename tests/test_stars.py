@@ -164,7 +164,10 @@ def test_launch_axes_stand_on_the_vertical() -> None:
         (f"{HEADER}\n1,361,3,0,0,3", "line 2: ra_deg is 361; accepted is a number from 0.0"),
         (f"{HEADER}\n1,2,-90.1,0,0,3", "line 2: dec_deg is -90.1"),
         (f"{HEADER}\n1.5,2,3,0,0,3", "line 2: hip is 1.5; accepted is a whole number"),
-        (f"{HEADER}\n{VEGA}\n{POLE}\n{VEGA}", "line 4: the star HIP 91262 is there twice, first on line 2"),
+        (
+            f"{HEADER}\n{VEGA}\n{POLE}\n{VEGA}",
+            "line 4: the star HIP 91262 is there twice, first on line 2",
+        ),
         ("\x00\x01 binary", "line 1: the header does not name hip"),
         (f"{HEADER}\n{VEGA}\n# caf\udce9", "line 3: not UTF-8 text"),
     ],

@@ -35,7 +35,7 @@ def table(source: Path, magnitude: float) -> str:
     kept = sorted(row for row in read_rows(source, SOURCE_COLUMNS) if row[-1] <= magnitude)
     if not kept:
         raise DataError(
-            f"{source}: no star is as bright as magnitude {magnitude:g}; accepted is a fainter limit"
+            f"{source}: no star is as bright as magnitude {magnitude:g}; accepted is a fainter one"
         )
     lines = [
         ",".join(form.format(value) for form, value in zip(FORMATS, row, strict=True))

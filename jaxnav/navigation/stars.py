@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
@@ -48,7 +49,7 @@ def brighter(catalogue: StarCatalogue, magnitude: float) -> StarCatalogue:
     return catalogue._replace(**columns)
 
 
-def directions(catalogue: StarCatalogue, year: float) -> Values:
+def directions(catalogue: StarCatalogue, year: Array | float) -> Values:
     """Return unit vectors ``(N, 3)`` in ICRS axes, with proper motion to a Julian year.
 
         s = u + (t - t0) (p mu_ra + q mu_dec),  normalised
@@ -69,7 +70,9 @@ def directions(catalogue: StarCatalogue, year: float) -> Values:
     return moved / np.linalg.norm(moved, axis=1, keepdims=True)
 
 
-def dcm_launch_icrs(latitude: float, sidereal_time: float, azimuth: float) -> Values:
+def dcm_launch_icrs(
+    latitude: Array | float, sidereal_time: Array | float, azimuth: Array | float
+) -> Values:
     """Return the rotation ``(3, 3)`` from ICRS axes to those of the launch-inertial frame.
 
     The axis y is the vertical of the spherical Earth at lift-off, x the direction of flight, z to

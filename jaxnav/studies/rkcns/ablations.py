@@ -1,6 +1,6 @@
 """Variations of the study: how many stars, how high, how well the atmosphere is known."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -91,16 +91,18 @@ def run_campaign(
 
 
 def run_ablations(
-    config: RkcnsConfig, progress: Callable[[int, int], None] | None = None
+    config: RkcnsConfig,
+    chosen: Sequence[Variation],
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Outcome]:
-    """Run every variation over the same keys as the study.
+    """Run variations over the same keys as the study.
 
     Args:
         config: The configuration of the scenario.
+        chosen: The variations.
         progress: Called with (variations done, variations).
     """
     outcomes: list[Outcome] = []
-    chosen = variations(config)
     for done, change in enumerate(chosen, start=1):
         varied = replace(config, **change.changes)
         # A trace is kept because the study keeps one: the program is then the same.

@@ -52,6 +52,8 @@ def _draw_components(result: StudyResult, path: Path, components: Sequence[str])
                 axes = grid[row, side]
                 _plot_methods(axes, result, a[key][:, :, column])
                 axes.set_ylabel(f"{what} of {name} [{unit}]")
+                if key == "trmse":
+                    axes.set_yscale("log")
         grid[0, 0].legend(ncols=2, fontsize=8)
         for axes in grid[-1]:
             axes.set_xlabel("time of flight [s]")
@@ -59,7 +61,7 @@ def _draw_components(result: StudyResult, path: Path, components: Sequence[str])
 
 
 def _plot_methods(axes, result: StudyResult, values: np.ndarray) -> None:
-    """Plot ``(T, methods)`` against time; a method that is far off does not set the scale."""
+    """Plot the histories ``(T, methods)`` against time."""
     a = result.arrays
     for i, name in enumerate(a["estimator"]):
         style = "--" if name == "oracle" else "-"
@@ -112,7 +114,7 @@ def _draw_variations(result: StudyResult, path: Path) -> None:
         axes.bar_label(
             bars,
             [
-                f" {v:.3g} m" if good else " not finite"
+                f" {v:.4g} m" if good else " not finite"
                 for v, good in zip(values, shown, strict=True)
             ],
             fontsize=8,

@@ -10,7 +10,12 @@ from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.studies.attitude import AXES, DIVERGED_SIGMAS
 from jaxnav.studies.base import StudyResult, check_simulated, plain, run_scenarios
 from jaxnav.studies.rkcns import cost
-from jaxnav.studies.rkcns.ablations import Outcome, run_ablations, run_campaign
+from jaxnav.studies.rkcns.ablations import (
+    Outcome,
+    run_ablations,
+    run_campaign,
+    variations,
+)
 from jaxnav.studies.rkcns.claims import COMPONENTS, POSITION, PUBLISHED, assess
 from jaxnav.studies.rkcns.config import SCENARIOS, RkcnsConfig
 from jaxnav.studies.rkcns.methods import METHODS
@@ -60,10 +65,18 @@ def check(config: RkcnsConfig) -> None:
 
 def _run_scenario(config: RkcnsConfig, progress: Callable[[int, int], None] | None) -> StudyResult:
     limb = build_world(config).limb
-    campaign = run_campaign(config, keep=1, progress=progress)
+    chosen = variations(config) if config.ablations else ()
+    total = config.runs * (1 + len(chosen))
+
+    def told(done: int, of: int) -> None:
+        del of
+        if progress is not None:
+            progress(done, total)
+
+    campaign = run_campaign(config, keep=1, progress=told)
     timed = config.cost and config.scenario == "listed"
     costs = cost.step_costs(config) if timed else None
-    outcomes = run_ablations(config) if config.ablations else []
+    outcomes = run_ablations(config, chosen, lambda done, of: told(config.runs * (1 + done), of))
     arrays, dims = _arrays(config, campaign, limb)
     if outcomes:
         arrays |= {
