@@ -93,7 +93,7 @@ class HeightModel(NamedTuple):
     slope: Array
 
 
-def model_height(model: HeightModel, angle: Array) -> Array:
+def model_height(model: HeightModel, angle: Array | float) -> Array:
     """Return the apparent height [m] of a ray by its refraction angle.
 
     Below :data:`ANGLE_FLOOR`, and so for zero and negative measurements, the height continues along
@@ -104,7 +104,7 @@ def model_height(model: HeightModel, angle: Array) -> Array:
         model: The model.
         angle: Refraction angle [rad], a scalar; ``jax.vmap`` for many.
     """
-    floored = jnp.where(angle > ANGLE_FLOOR, angle, ANGLE_FLOOR)
+    floored = jnp.maximum(angle, ANGLE_FLOOR)
     x = jnp.log(floored / ARCSEC)
     piece = jnp.maximum(jnp.sum(x >= model.knots) - 1, 0)
     c, t = model.coefficients[piece], x - model.knots[piece]
