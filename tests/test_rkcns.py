@@ -143,11 +143,8 @@ def test_listed_filters_are_consistent(listed: StudyResult) -> None:
 
 
 @pytest.mark.slow
-def test_augmentation_takes_the_bias_of_the_logarithm_away(listed: StudyResult) -> None:
-    """Vertically, where the heights' common bias goes; at 40 km it is the largest error."""
-    y = listed.arrays["mean_square"][:, :, 1]
-    ours, plain = (y[:, METHODS.index(name)] for name in ("modified-iterated-ckf", "ckf"))
-    assert rmse_ratio(ours, plain).high < 1
+def test_augmentation_takes_the_bias_of_the_logarithm_away() -> None:
+    """At 40 km it is the largest error of a filter that takes the noise for additive."""
     high = replace(BARE, tangent_km=(39.0, 41.0), point_spread=0.1)
     square = run_campaign(high, keep=1).rows.mean_square[:, :, :3].sum(axis=-1)
     ckf, modified, bound = (

@@ -8,8 +8,18 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.filters.innovation import masked_innovation
-from jaxnav.estimation.filters.kalman import KalmanState, ekf, kf
-from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs, Params, Point
+from jaxnav.estimation.filters.kalman import KalmanState, ekf
+from jaxnav.estimation.types import (
+    Filter,
+    FilterParams,
+    Info,
+    Input,
+    Model,
+    Obs,
+    Params,
+    Point,
+)
+from jaxnav.numerics.linalg import matmul
 
 
 def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filter:
@@ -53,30 +63,34 @@ def linearised_at_truth(model: Model, truth: Callable[[Input], tuple[Point, Poin
         IEEE Trans. Signal Processing 46(5).
     """
 
-    def transition(params: Params, dx: Array, u: Input) -> Array:
+    def moved(params: Params, dx: Array, u: Input) -> Array:
         before, after = truth(u)
+        return model.local(after, model.transition(params, model.retract(before, dx), u))
 
-        def moved(dx: Array) -> Array:
-            return model.local(after, model.transition(params, model.retract(before, dx), u))
-
-        start, change = jax.jvp(moved, (jnp.zeros_like(dx),), (dx,))
-        return start + change
-
-    def observe(params: Params, dx: Array, u: Input) -> Array:
+    def seen(params: Params, dx: Array, u: Input) -> Array:
         _, after = truth(u)
         z = model.observe(params, after, u)
+        return model.residual(model.observe(params, model.retract(after, dx), u), z)
 
-        def seen(dx: Array) -> Array:
-            return model.residual(model.observe(params, model.retract(after, dx), u), z)
+    def jacobians(params: Params, dx: Array, u: Input) -> tuple[Array, Array]:
+        zero = jnp.zeros_like(dx)
+        return jax.jacfwd(moved, 1)(params, zero, u), jax.jacfwd(seen, 1)(params, zero, u)
 
-        return jax.jvp(seen, (jnp.zeros_like(dx),), (dx,))[1]
+    def transition(params: Params, dx: Array, u: Input) -> Array:
+        Phi, _ = jacobians(params, dx, u)
+        return moved(params, jnp.zeros_like(dx), u) + matmul(Phi, dx)
 
-    errors = kf(
+    def observe(params: Params, dx: Array, u: Input) -> Array:
+        _, H = jacobians(params, dx, u)
+        return matmul(H, dx)
+
+    errors = ekf(
         Model(
             transition,
             lambda params, dx, u: model.process_noise(params, truth(u)[0], u),
             observe,
             lambda params, dx, u: model.observation_noise(params, truth(u)[1], u),
+            jacobians=jacobians,
         )
     )
 
