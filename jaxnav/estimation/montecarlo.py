@@ -62,6 +62,7 @@ def monte_carlo(
     tile: int | None = None,
     devices: Sequence[Any] | None = None,
     keep: int = 0,
+    compile_in_turn: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Campaign:
     """Run a Monte Carlo study; run ``i`` has the key ``fold_in(key, i)`` whatever the tiling.
@@ -79,6 +80,8 @@ def monte_carlo(
         tile: Runs per tile and device; the default spreads the runs evenly, at most :data:`TILE`.
         devices: Devices to use; the default is all local ones.
         keep: Number of first runs whose ``trace`` is kept.
+        compile_in_turn: Compile for one device after the other instead of for all at once: a large
+            program takes more memory to compile than to run.
         progress: Called with (runs done, runs) after each round of tiles, on the host.
 
     Returns:
@@ -103,14 +106,21 @@ def monte_carlo(
     # A thread does not inherit the precision that a context manager has set for its caller.
     wide = jnp.result_type(float) == jnp.float64
 
-    def compute(start: int, place: int) -> tuple[RunOutput, Array]:
+    def launch(start: int, place: int) -> tuple[RunOutput, Array]:
         first = np.int32(start + place * tile)
         with jax.enable_x64(wide):
-            return jax.block_until_ready(_run_tile(run_one, tile, keep > 0, first, *inputs[place]))
+            return _run_tile(run_one, tile, keep > 0, first, *inputs[place])
+
+    def compute(start: int, place: int) -> tuple[RunOutput, Array]:
+        return jax.block_until_ready(launch(start, place))
 
     with ThreadPoolExecutor(len(chosen)) as pool:
         for start in range(0, runs, stride):
-            results = list(pool.map(partial(compute, start), range(len(chosen))))
+            if compile_in_turn and start == 0:
+                # A call returns once it has compiled; the devices then run side by side.
+                results = jax.block_until_ready([launch(0, place) for place in range(len(chosen))])
+            else:
+                results = list(pool.map(partial(compute, start), range(len(chosen))))
             for place, (output, finite) in enumerate(results):
                 first = start + place * tile
                 count = min(max(runs - first, 0), tile)

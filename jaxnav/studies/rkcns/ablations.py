@@ -87,7 +87,9 @@ def run_campaign(
     """Run the Monte Carlo of one scenario; options are those of ``monte_carlo``."""
     shared = shared_of(config, build_world(config))
     one = run_one(setup_of(config, methods, printed=printed))
-    return monte_carlo(one, jax.random.key(config.seed), config.runs, shared, **options)
+    key = jax.random.key(config.seed)
+    large = len(methods) > 1
+    return monte_carlo(one, key, config.runs, shared, compile_in_turn=large, **options)
 
 
 def run_ablations(
