@@ -315,8 +315,8 @@ def test_step_without_observation_is_a_prediction(name: str) -> None:
     """That the state is the predicted one shows in the comparison with the NumPy filter."""
     _, info = batch_run(name, CASES[name].params, PROBLEM.z).record
     assert not np.any(PROBLEM.valid[LOST])
-    # a bank's is log(sum of weights), which is one to rounding
-    assert np.abs(info.log_likelihood[:, LOST]).max() <= 4 * np.finfo(float).eps
+    # A bank's is log(sum of weights): log-weights of a few units are themselves right to as many eps.
+    assert np.abs(info.log_likelihood[:, LOST]).max() <= 16 * np.finfo(float).eps
     np.testing.assert_array_equal(info.nis[:, LOST], 0)
     np.testing.assert_array_equal(info.innovation[:, LOST], 0)
     raised = np.asarray(info.flags) == Flag.NO_OBSERVATION
