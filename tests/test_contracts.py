@@ -315,7 +315,7 @@ def test_step_without_observation_is_a_prediction(name: str) -> None:
     """That the state is the predicted one shows in the comparison with the NumPy filter."""
     _, info = batch_run(name, CASES[name].params, PROBLEM.z).record
     assert not np.any(PROBLEM.valid[LOST])
-    # A bank's is log(sum of weights), of log-weights that are right to as many eps as they are units.
+    # The log of the sum of its weights, for a bank, right to the rounding of its log-weights.
     assert np.abs(info.log_likelihood[:, LOST]).max() <= 16 * np.finfo(float).eps
     np.testing.assert_array_equal(info.nis[:, LOST], 0)
     np.testing.assert_array_equal(info.innovation[:, LOST], 0)
