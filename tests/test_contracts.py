@@ -131,6 +131,7 @@ def _cases() -> dict[str, Case]:
         "imm": (imm(base), SWITCHING),
         "mmae of ukf": (mmae(singles["ukf"]), ()),
         "immae of ckf": (immae(singles["ckf"]), ((), reset)),
+        "mmae of iterated_ckf": (mmae(singles["iterated_ckf"]), ()),
     }
     cases = {name: Case(made, single(), single()) for name, made in singles.items()}
     for name, (made, rule) in banks.items():
@@ -252,6 +253,7 @@ WEIGHTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mmae": bayes_weights,
     "mmae of square roots": bayes_weights,
     "mmae of ukf": bayes_weights,
+    "mmae of iterated_ckf": bayes_weights,
     "immae": lambda rows: immae_weights(rows, 5, 0.9),
     "immae of ckf": lambda rows: immae_weights(rows, 5, 0.9),
     "floor": lambda rows: floor_weights(rows, 1e-3),
@@ -356,7 +358,7 @@ def test_second_call_does_not_trace_again(name: str) -> None:
 
 BOTH_MODES = ("kf", "square_root_kf")
 """Forward mode is what reverse mode transposes: twice is enough for what it costs to compile."""
-COSTLY = ("immae of ckf",)
+COSTLY = ("immae of ckf", "mmae of iterated_ckf")
 """Members and a rule whose gradients are tested, but not together."""
 
 

@@ -11,6 +11,11 @@ import pytest
 from jax import Array
 
 from jaxnav.estimation.banks.mixture import BankParams, mmae
+from jaxnav.estimation.filters.iterated import (
+    iterated_ckf,
+    iterated_ekf,
+    modified_iterated_ckf,
+)
 from jaxnav.estimation.filters.kalman import ekf, kf
 from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
 from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
@@ -37,8 +42,11 @@ BUILDERS = {
     "ckf": ckf,
     "square_root_ukf": square_root_ukf,
     "square_root_ckf": square_root_ckf,
+    "iterated_ekf": iterated_ekf,
+    "iterated_ckf": iterated_ckf,
+    "modified_iterated_ckf": modified_iterated_ckf,
 }
-COVARIANCE_FORMS = ("kf", "ekf", "ukf", "ckf")
+COVARIANCE_FORMS = ("kf", "ekf", "ukf", "ckf", "iterated_ckf", "modified_iterated_ckf")
 RUNS = ("kf", "square_root_kf", "ukf", "square_root_ckf")
 each_filter = pytest.mark.parametrize("name", BUILDERS)
 # a run costs seconds to compile: one of each form; of a linear model the extended filters differ
@@ -124,6 +132,9 @@ def exact_posterior(delta: float) -> np.ndarray:
         ("square_root_ekf", jnp.float64, 1e-9, 1e-6),
         ("ukf", jnp.float64, 1e-6, 1e-7),
         ("ckf", jnp.float64, 1e-6, 1e-7),
+        ("iterated_ekf", jnp.float64, 1e-6, 1e-7),
+        ("iterated_ckf", jnp.float64, 1e-6, 1e-7),
+        ("modified_iterated_ckf", jnp.float64, 1e-6, 1e-7),
         ("square_root_ukf", jnp.float64, 1e-9, 1e-6),
         ("square_root_ckf", jnp.float64, 1e-9, 1e-6),
         ("kf", jnp.float32, 1e-2, 1e-3),
@@ -132,6 +143,9 @@ def exact_posterior(delta: float) -> np.ndarray:
         ("square_root_ekf", jnp.float32, 1e-4, 1e-3),
         ("ukf", jnp.float32, 3e-3, 1e-3),
         ("ckf", jnp.float32, 3e-3, 1e-3),
+        ("iterated_ekf", jnp.float32, 3e-3, 1e-3),
+        ("iterated_ckf", jnp.float32, 3e-3, 1e-3),
+        ("modified_iterated_ckf", jnp.float32, 3e-3, 1e-3),
         ("square_root_ukf", jnp.float32, 1e-4, 1e-3),
         ("square_root_ckf", jnp.float32, 1e-4, 1e-3),
     ],
@@ -184,7 +198,7 @@ def test_covariance_form_flags_what_it_cannot_solve(name: str, delta: float) -> 
     assert np.all(np.isfinite(estimate.cov))
 
 
-@pytest.mark.parametrize("name", ["kf", "ukf", "ckf"])
+@pytest.mark.parametrize("name", ["kf", "ukf", "ckf", "iterated_ckf"])
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_no_wrong_covariance_goes_without_a_flag(name: str, dtype: jnp.dtype) -> None:
     """A sweep of 120 cases, from those that are easy to those that are lost to rounding."""
