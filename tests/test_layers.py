@@ -21,6 +21,7 @@ ORDER = (
     "estimation.filters.kalman",
     "estimation.filters.square_root",
     "estimation.filters.sigma_point",
+    "estimation.filters.line_search",
     "estimation.filters.iterated",
     "estimation.banks.weights",
     "estimation.banks.mixture",

@@ -22,6 +22,7 @@ from jax import Array
 
 from jaxnav.estimation.filters.innovation import innovation_info, mask_noise, masked_innovation
 from jaxnav.estimation.filters.kalman import KalmanState, ekf
+from jaxnav.estimation.filters.line_search import Search, step_length
 from jaxnav.estimation.filters.sigma_point import SigmaPointState, ckf
 from jaxnav.estimation.types import (
     Filter,
@@ -29,7 +30,6 @@ from jaxnav.estimation.types import (
     Info,
     Input,
     Model,
-    NonAdditive,
     Obs,
     Params,
     Point,
@@ -44,29 +44,11 @@ from jaxnav.numerics.linalg import (
 )
 
 
-class Search(NamedTuple):
-    """The numbers of an iterated update: leaves, so that they may be tuned or differ in a bank.
-
-    Attributes:
-        spread: Spread of the cubature points about an iterate, as a factor on that of the prior:
-            1 is the paper's, near 0 makes them differences, and the fixed point the mode.
-        step: Longest step tried; the search halves it.
-        sufficient: Share of the decrease that the slope promises which a step must reach.
-        temperature: 0 takes the first step that reaches it. Above, in units of T, every acceptance
-            is a sigmoid and the step their mean, which has a gradient.
-    """
-
-    spread: Array | float = 1.0
-    step: Array | float = 1.0
-    sufficient: Array | float = 1e-4
-    temperature: Array | float = 0.0
-
-
 class _Slope(NamedTuple):
     """The observation about an iterate, in whitened coordinates; masked channels are zero.
 
     Attributes:
-        innovation: ``(m,)`` what is to be explained by the state and its noise.
+        innovation: ``(m,)`` what the mean about the iterate leaves to be explained.
         A: ``(m, n)`` derivative with respect to the state.
         G: ``(m, k)`` derivative with respect to the noise in the state; k is 0 if it is not there.
         R: ``(m, m)`` covariance of the noise.
@@ -93,13 +75,15 @@ class _Step(NamedTuple):
 class _Problem(NamedTuple):
     """One update in ``size`` whitened coordinates: the ``states``, then those of augmented noise.
 
-    ``predicted`` maps a point to the observation ``(m,)``, ``noise`` is the covariance that adds.
+    ``predicted`` maps a point to the observation ``(m,)``, ``noise`` is the covariance that adds;
+    ``sound`` tells whether that of the augmented noise has a root.
     """
 
     predicted: Callable[[Array], Array]
     noise: Array
     states: int
     size: int
+    sound: Array
 
 
 class _Form(NamedTuple):
@@ -109,14 +93,14 @@ class _Form(NamedTuple):
         base: The filter whose ``init`` and ``predict`` are used.
         mended: ``(state) -> bool`` whether a covariance was mended in making the state.
         rebuilt: ``(x, P) -> state``.
-        problem: ``(model, params, x, L, u) -> _Problem``.
+        problem: ``(model, params, x, L, u, obs) -> _Problem``.
         slope: ``(model, problem, obs, point, search) -> (residual's mean, slope, spread noise)``.
     """
 
     base: Filter
     mended: Callable[[Any], Array]
     rebuilt: Callable[[Point, Array], Any]
-    problem: Callable[[Model, Params, Point, Array, Input], _Problem]
+    problem: Callable[[Model, Params, Point, Array, Input, Obs], _Problem]
     slope: Callable[[Model, _Problem, Obs, Array, Search], tuple[Array, Array, Array]]
 
 
@@ -227,7 +211,7 @@ def _iterated(
         prior = form.base.estimate(state)
         whitening = semidefinite_root(prior.cov)
         L = whitening.factor
-        problem = form.problem(model, params.model, prior.mean, L, u)
+        problem = form.problem(model, params.model, prior.mean, L, u, obs)
 
         def iterate(point: Array, _: None) -> tuple[Array, _Step]:
             at = jnp.zeros_like(point) if printed else point
@@ -236,8 +220,8 @@ def _iterated(
             length = rule.step
             if trials and not printed:
                 length = _search_length(model, problem, obs, slope, point, moved, rule, trials)
-            length = jnp.where(solved.root.positive_definite, length, 0)
-            return point + length * moved, solved._replace(moved=length > 0)
+            step = jnp.where(solved.root.positive_definite, length, 0) * moved
+            return point + step, solved._replace(moved=jnp.any(step != 0))
 
         point, steps = jax.lax.scan(
             iterate, jnp.zeros(problem.size, L.dtype), None, length=iterations
@@ -248,7 +232,9 @@ def _iterated(
         whitened = left @ left.T + last.gain @ noise @ last.gain.T
         x = model.retract(prior.mean, L @ point[: problem.states])
         mended = form.mended(state) | ~whitening.semidefinite
-        info = innovation_info(first.slope.innovation, first.S, first.root, obs.valid, mended)
+        solvable = jnp.all(steps.root.positive_definite)
+        judged = first.root._replace(positive_definite=solvable)
+        info = innovation_info(first.slope.innovation, first.S, judged, obs.valid, mended)
         taken = jnp.sum(steps.moved).astype(jnp.int32)
         return form.rebuilt(x, symmetrise(L @ whitened @ L.T)), info._replace(iterations=taken)
 
@@ -270,27 +256,31 @@ def _sigma_state(x: Point, P: Array) -> SigmaPointState:
     return SigmaPointState(x, P, (), jnp.array(False))
 
 
-def _additive(model: Model, params: Params, x: Point, L: Array, u: Input) -> _Problem:
+def _additive(model: Model, params: Params, x: Point, L: Array, u: Input, obs: Obs) -> _Problem:
     """Return the update over the state alone."""
+    del obs
     n = L.shape[0]
     R = model.observation_noise(params, x, u)
-    return _Problem(lambda at: model.observe(params, model.retract(x, L @ at), u), R, n, n)
+    sound = jnp.array(True)
+    return _Problem(lambda at: model.observe(params, model.retract(x, L @ at), u), R, n, n, sound)
 
 
-def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input) -> _Problem:
+def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input, obs: Obs) -> _Problem:
     """Return the update over the state and the noise of its observation."""
     n = L.shape[0]
-    noisy = model.noisy or NonAdditive(
-        lambda params, x, v, u: model.observe(params, x, u) + v, model.observation_noise
-    )
-    given = noisy.noise(params, x, u)
-    root = jnp.diag(jnp.sqrt(given)) if given.ndim == 1 else semidefinite_root(given).factor
+    if model.noisy is None:
+        observe = lambda params, x, v, u: model.observe(params, x, u) + v  # noqa: E731
+        given = mask_noise(model.observation_noise(params, x, u), obs.valid)
+    else:
+        observe, given = model.noisy.observe, model.noisy.noise(params, x, u)
+    root = semidefinite_root(jnp.diag(given) if given.ndim == 1 else given)
+    factor = jnp.where(root.semidefinite, root.factor, 0)
 
     def predicted(at: Array) -> Array:
-        return noisy.observe(params, model.retract(x, L @ at[:n]), root @ at[n:], u)
+        return observe(params, model.retract(x, L @ at[:n]), factor @ at[n:], u)
 
-    zero = jnp.zeros(jax.eval_shape(model.observe, params, x, u).shape, L.dtype)
-    return _Problem(predicted, zero, n, n + root.shape[0])
+    none = jnp.zeros(obs.valid.shape, L.dtype)
+    return _Problem(predicted, none, n, n + factor.shape[0], root.semidefinite)
 
 
 def _slope(
@@ -301,9 +291,8 @@ def _slope(
     nu = masked_innovation(model, obs, problem.predicted(point))
     mean, whole, spread_noise = form.slope(model, problem, obs, point, search)
     A, G = whole[:, :n], whole[:, n:]
-    added = jnp.diag(problem.noise) if problem.noise.ndim == 1 else problem.noise
-    R = mask_noise(added + G @ G.T, obs.valid)
-    return _Slope(nu - mean + G @ point[n:], A, G, R, spread_noise)
+    R = mask_noise(problem.noise, obs.valid) + G @ G.T
+    return _Slope(nu - mean, A, G, R, spread_noise)
 
 
 def _cubature(
@@ -318,7 +307,7 @@ def _cubature(
         residual = model.residual(problem.predicted(point + offset), reference)
         return jnp.where(obs.valid, residual, 0)
 
-    ahead, behind = jax.vmap(seen)(offsets), jax.vmap(seen)(-offsets)
+    ahead, behind = jnp.split(jax.vmap(seen)(jnp.concatenate([offsets, -offsets])), 2)
     even = 0.5 * (ahead + behind)
     mean = jnp.mean(even, axis=0)
     scatter = even - mean[None]
@@ -345,11 +334,11 @@ def _gauss_newton(
     """Return the full step ``(d,)`` from a point."""
     S = symmetrise(slope.A @ slope.A.T) + slope.R + slope.spread_noise
     root = cholesky(S)
-    state = point[: problem.states]
+    root = root._replace(positive_definite=root.positive_definite & problem.sound)
     whole = jnp.concatenate([slope.A, slope.G], axis=1)
     gain = solve_lower_transposed(root.factor, solve_lower(root.factor, whole)).T
     gain = jnp.where(root.positive_definite, gain, 0)
-    target = gain @ (slope.innovation + slope.A @ state)
+    target = gain @ (slope.innovation + whole @ point)
     moved = target + point if printed else target - point
     return moved, _Step(slope, S, root, gain[: problem.states], jnp.array(True))
 
@@ -373,28 +362,15 @@ def _search_length(
     root = cholesky(slope.R)
     held = slope.G @ point[n:]
 
-    def functional(state: Array, misfit: Array) -> Array:
-        whitened = solve_lower(root.factor, misfit)
-        return jnp.sum(state * state) + jnp.sum(whitened * whitened)
-
-    def tried(length: Array) -> Array:
+    def functional(length: Array) -> Array:
         state = point[:n] + length * moved[:n]
         seen = problem.predicted(jnp.concatenate([state, point[n:]]))
-        misfit = masked_innovation(model, obs, seen) + jnp.where(obs.valid, held, 0)
-        return functional(state, misfit)
+        whitened = solve_lower(root.factor, masked_innovation(model, obs, seen) + held)
+        return jnp.sum(state * state) + jnp.sum(whitened * whitened)
 
-    lengths = search.step * 0.5 ** jnp.arange(trials, dtype=point.dtype)
-    start = tried(jnp.zeros((), point.dtype))
-    pull = solve_lower_transposed(root.factor, solve_lower(root.factor, slope.innovation))
-    gradient = 2 * (point[:n] - slope.A.T @ pull)
-    promised = jnp.minimum(gradient @ moved[:n], 0)
-    margin = start + search.sufficient * lengths * promised - jax.vmap(tried)(lengths)
-    known = jnp.isfinite(margin)
-    margin = jnp.where(known, margin, 0)
-    soft = jnp.asarray(search.temperature, point.dtype)
-    smooth = jax.nn.sigmoid(margin / jnp.where(soft > 0, soft, 1))
-    accepted = jnp.where(soft > 0, smooth, (margin >= 0).astype(point.dtype))
-    accepted = jnp.where(known, accepted, 0)
-    refused = jnp.concatenate([jnp.ones(1, point.dtype), jnp.cumprod(1 - accepted)[:-1]])
+    misfit = slope.innovation + held
+    pull = solve_lower_transposed(root.factor, solve_lower(root.factor, misfit))
+    promised = 2 * (point[:n] - slope.A.T @ pull) @ moved[:n]
     # Without noise there is no functional to search on.
-    return jnp.where(root.positive_definite, jnp.sum(refused * accepted * lengths), search.step)
+    length = step_length(functional, promised, search, trials)
+    return jnp.where(root.positive_definite, length, search.step)

@@ -10,7 +10,8 @@ import numpy as np
 from jax import Array
 
 from jaxnav.estimation.bounds import linearised_at_truth
-from jaxnav.estimation.filters.iterated import Search, iterated_ckf, modified_iterated_ckf
+from jaxnav.estimation.filters.iterated import iterated_ckf, modified_iterated_ckf
+from jaxnav.estimation.filters.line_search import Search
 from jaxnav.estimation.filters.sigma_point import ckf
 from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.montecarlo import RunOutput
