@@ -464,7 +464,15 @@ def _misfits() -> dict[str, tuple[Model, FilterParams, Obs, str]]:
 
 
 MISFITS = _misfits()
-BUILDERS = (ekf, square_root_ekf, ukf, square_root_ukf)
+BUILDERS = (
+    ekf,
+    square_root_ekf,
+    ukf,
+    square_root_ukf,
+    iterated_ekf,
+    iterated_ckf,
+    modified_iterated_ckf,
+)
 
 
 @pytest.mark.parametrize("build", BUILDERS)

@@ -62,6 +62,13 @@ def rmse_ratio(
     return Interval(value, value * float(np.exp(-width)), value * float(np.exp(width)))
 
 
+def rmse_change(
+    numerator: np.ndarray, denominator: np.ndarray, confidence: float = 0.95
+) -> Interval:
+    """Return the relative change between two RMSE over the same runs, :func:`rmse_ratio` less 1."""
+    return Interval(*(bound - 1 for bound in rmse_ratio(numerator, denominator, confidence)))
+
+
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
     """Return the mean of ``(N,)`` values with the interval of Student's t."""
     value = float(np.mean(values))

@@ -82,8 +82,7 @@ class HeightModel(NamedTuple):
 
     Attributes:
         knots: ``(pieces,)`` lower ends of the pieces in ``ln(R / 1 arcsec)``, infinite after those
-            in use, so that all models have one shape. Below all of them the first piece
-            is meant.
+            in use, so that all models have one shape. Below all of them the first piece is meant.
         coefficients: ``(pieces, 4) [m]``.
         slope: [m/rad].
     """
@@ -98,7 +97,7 @@ def model_height(model: HeightModel, angle: Array | float) -> Array:
 
     Below :data:`ANGLE_FLOOR`, and so for zero and negative measurements, the height continues along
     the tangent at that angle: finite, continuous with its derivative, and with so steep a slope
-    (some 64 km per arc second) that a filter gives such a measurement no weight.
+    (tens of kilometres per arc second) that a filter gives such a measurement no weight.
 
     Args:
         model: The model.
@@ -141,8 +140,8 @@ def fitted_model(low: float = 20e3, high: float = 40e3, radius: float = MEAN_RAD
     """Return the model that fits the traced standard atmosphere over a band of tangent heights.
 
     A cubic spline in ln R, by least squares, and straight beyond the band; its knots lie closer
-    where the lapse rate jumps. From
-    20 to 40 km it is within 13 m of the trace, 0.6 m in the root mean square.
+    where the lapse rate jumps. From 20 to 40 km it is within 13 m of the trace, 0.6 m in the root
+    mean square.
 
     Args:
         low: Lower end of the band [m].

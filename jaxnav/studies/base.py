@@ -186,6 +186,17 @@ def untested(config: Any, free: tuple[str, ...]) -> str | None:
     return f"not at the study's default: {', '.join(changed)}" if changed else None
 
 
+def judged(config: Any, free: tuple[str, ...], claims: list[Claim]) -> list[Claim]:
+    """Return the claims, "not testable" if the configuration keeps them from being tested.
+
+    Arguments are those of :func:`untested`.
+    """
+    reason = untested(config, free)
+    if reason is None:
+        return claims
+    return [replace(claim, verdict="not testable", why=reason) for claim in claims]
+
+
 def verdict(holds: bool) -> str:
     """Return the word for a claim that holds or does not."""
     return "reproduced" if holds else "not reproduced"

@@ -20,13 +20,18 @@ def masked_innovation(model: Model, obs: Obs, z_pred: Array) -> Array:
     Raises:
         ValueError: If the observation and the model's prediction of it differ in shape.
     """
-    if obs.z.shape != z_pred.shape or obs.valid.shape != z_pred.shape:
-        raise ValueError(
-            f"the observation has z {obs.z.shape} and valid {obs.valid.shape}; "
-            f"the model observes {z_pred.shape}"
-        )
+    require_channels(obs, z_pred.shape)
     z = jnp.where(obs.valid, obs.z, z_pred)
     return jnp.where(obs.valid, model.residual(z, z_pred), 0)
+
+
+def require_channels(obs: Obs, observed: tuple[int, ...]) -> None:
+    """Raise ``ValueError`` unless the observation has the shape that the model observes."""
+    if obs.z.shape != observed or obs.valid.shape != observed:
+        raise ValueError(
+            f"the observation has z {obs.z.shape} and valid {obs.valid.shape}; "
+            f"the model observes {observed}"
+        )
 
 
 def mask_noise(R: Array, valid: Array) -> Array:

@@ -20,7 +20,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.innovation import innovation_info, mask_noise, masked_innovation
+from jaxnav.estimation.filters.innovation import (
+    innovation_info,
+    mask_noise,
+    masked_innovation,
+    require_channels,
+)
 from jaxnav.estimation.filters.kalman import KalmanState, ekf
 from jaxnav.estimation.filters.line_search import Search, step_length
 from jaxnav.estimation.filters.sigma_point import SigmaPointState, ckf
@@ -142,6 +147,11 @@ def iterated_ckf(
     a step that does not lower ``T`` enough is halved, and where none does the iterate stays.
     ``FilterParams.search`` overrides the numbers of the search as leaves. ``Info`` holds the
     innovation and likelihood of the prediction, and the number of steps that were accepted.
+
+    ``T`` knows the function, the step with a full spread its statistical linearisation only: where
+    the two disagree all steps may be refused while the covariance still shrinks, which happened in
+    11 to 23 % of strongly nonlinear scalar cases. A smaller ``search.spread`` mends that. Range on
+    ill-conditioned updates: as the ``ckf``.
 
     Args:
         model: The model.
@@ -268,6 +278,7 @@ def _additive(model: Model, params: Params, x: Point, L: Array, u: Input, obs: O
 def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input, obs: Obs) -> _Problem:
     """Return the update over the state and the noise of its observation."""
     n = L.shape[0]
+    require_channels(obs, jax.eval_shape(model.observe, params, x, u).shape)
     if model.noisy is None:
         observe = lambda params, x, v, u: model.observe(params, x, u) + v  # noqa: E731
         given = mask_noise(model.observation_noise(params, x, u), obs.valid)

@@ -120,7 +120,6 @@ def sins_rkcns(period: float, imu_step: float, radius: float, ray: RayForm = "he
     if ray not in _RAYS:
         raise ValueError(f"ray is {ray!r}; it must be one of {', '.join(_RAYS)}")
     rays = _RAYS[ray]
-    s = LAYOUT
 
     def transition(params: SinsRkcnsParams, x: SinsTotal, u: SinsRkcnsInput) -> SinsTotal:
         del params
@@ -134,21 +133,12 @@ def sins_rkcns(period: float, imu_step: float, radius: float, ray: RayForm = "he
         dcm = matmul(x.dcm, so3_exp(u.dtheta - period * x.drift))
         return SinsTotal(dcm, v, r, x.drift, x.bias)
 
-    def process_noise(params: SinsRkcnsParams, x: SinsTotal, u: SinsRkcnsInput) -> Array:
-        del u
-        turned = matmul(x.dcm * (period * imu_step * params.gyro_noise**2)[None], x.dcm.T)
-        pushed = params.disturbance**2 * jnp.eye(3, dtype=x.dcm.dtype)
-        Q = jnp.zeros((15, 15), x.dcm.dtype)
-        Q = Q.at[s.phi, s.phi].set(turned).at[s.dv, s.dv].set(period * pushed)
-        Q = Q.at[s.dr, s.dr].set(period**3 / 3 * pushed)
-        both = period**2 / 2 * pushed
-        return Q.at[s.dv, s.dr].set(both).at[s.dr, s.dv].set(both)
-
     def observed_rays(params: SinsRkcnsParams, x: SinsTotal, v: Array, u: SinsRkcnsInput) -> Array:
         """Return the channels ``(n,)`` of the stars for noise ``(n + 1,)``, density last."""
         centred = x.position + jnp.array([0.0, 1.0, 0.0], v.dtype) * radius
-        one = partial(rays, params.atmosphere, radius, centred, u.density, v[-1])
-        return jax.vmap(one)(u.star, u.angle, v[:-1])
+        scale = u.density * (1 + v[-1])
+        one = partial(rays, params.atmosphere, radius, centred, scale)
+        return jax.vmap(one)(_Ray(u.star, u.angle, v[:-1]))
 
     def disturbed(params: SinsRkcnsParams, x: SinsTotal, v: Array, u: SinsRkcnsInput) -> Array:
         attitude = so3_log(so3_retract(x.dcm, v[:3]))
@@ -176,7 +166,7 @@ def sins_rkcns(period: float, imu_step: float, radius: float, ray: RayForm = "he
 
     return Model(
         transition,
-        process_noise,
+        partial(_process_noise, period, imu_step),
         observe,
         observation_noise,
         _residual,
@@ -186,36 +176,42 @@ def sins_rkcns(period: float, imu_step: float, radius: float, ray: RayForm = "he
     )
 
 
+def _process_noise(
+    period: float, imu_step: float, params: SinsRkcnsParams, x: SinsTotal, u: SinsRkcnsInput
+) -> Array:
+    del u
+    s = LAYOUT
+    turned = matmul(x.dcm * (period * imu_step * params.gyro_noise**2)[None], x.dcm.T)
+    pushed = params.disturbance**2 * jnp.eye(3, dtype=x.dcm.dtype)
+    Q = jnp.zeros((15, 15), x.dcm.dtype)
+    Q = Q.at[s.phi, s.phi].set(turned).at[s.dv, s.dv].set(period * pushed)
+    Q = Q.at[s.dr, s.dr].set(period**3 / 3 * pushed)
+    both = period**2 / 2 * pushed
+    return Q.at[s.dv, s.dr].set(both).at[s.dr, s.dv].set(both)
+
+
+class _Ray(NamedTuple):
+    """A star's direction ``(3,)``, its refraction angle as measured and the noise of that [rad]."""
+
+    star: Array
+    measured: Array
+    noise: Array
+
+
 def _height_difference(
-    atmosphere: HeightModel,
-    radius: float,
-    position: Array,
-    density: Array,
-    density_error: Array,
-    star: Array,
-    measured: Array,
-    noise: Array,
+    atmosphere: HeightModel, radius: float, position: Array, density: Array, ray: _Ray
 ) -> Array:
     """Return the height of a ray by the atmosphere less that by the geometry [m]."""
-    angle = measured - noise
-    by_atmosphere = model_height(atmosphere, angle / (density * (1 + density_error)))
-    return by_atmosphere - ray_height(position, star, angle, radius)
+    angle = ray.measured - ray.noise
+    by_atmosphere = model_height(atmosphere, angle / density)
+    return by_atmosphere - ray_height(position, ray.star, angle, radius)
 
 
 def _angle(
-    atmosphere: RefractionTable,
-    radius: float,
-    position: Array,
-    density: Array,
-    density_error: Array,
-    star: Array,
-    measured: Array,
-    noise: Array,
+    atmosphere: RefractionTable, radius: float, position: Array, density: Array, ray: _Ray
 ) -> Array:
     """Return the angle that is measured [rad]."""
-    del measured
-    scale = density * (1 + density_error)
-    return seen_refraction(atmosphere, position, star, scale, radius).angle + noise
+    return seen_refraction(atmosphere, position, ray.star, density, radius).angle + ray.noise
 
 
 _RAYS = {"height": _height_difference, "angle": _angle}

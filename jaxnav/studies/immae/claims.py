@@ -1,13 +1,11 @@
 """The paper's tables and claims, and what became of them."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from jaxnav.estimation.metrics import mean_interval, rmse_ratio
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.studies.attitude import AXES
-from jaxnav.studies.base import Claim, untested, verdict
+from jaxnav.studies.base import Claim, judged, verdict
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.methods import BANKS, METHODS
 from jaxnav.units import ARCSEC
@@ -55,10 +53,7 @@ def assess(config: ImmaeConfig, campaign: Campaign) -> list[Claim]:
         claims.append(_first_model_chosen(config, campaign))
     elif len(config.theta) > 1:
         claims += [_second_model_chosen(config, campaign), _mmae_is_slow(config, campaign)]
-    reason = untested(config, FREE)
-    if reason is None:
-        return claims
-    return [replace(claim, verdict="not testable", why=reason) for claim in claims]
+    return judged(config, FREE, claims)
 
 
 def _squares(campaign: Campaign, method: str, axis: str) -> np.ndarray:

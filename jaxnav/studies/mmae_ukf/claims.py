@@ -1,14 +1,12 @@
 """The paper's claims, and what became of them; its Table II is not available."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from jaxnav.estimation.metrics import Interval, rmse_ratio
+from jaxnav.estimation.metrics import Interval, rmse_change
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.numerics.sequences import hammersley, star_discrepancy
 from jaxnav.studies.attitude import AXES
-from jaxnav.studies.base import Claim, untested, verdict
+from jaxnav.studies.base import Claim, judged, verdict
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
 from jaxnav.studies.mmae_ukf.methods import METHODS
 
@@ -53,23 +51,19 @@ def assess(
         _ukf_beats_ekf(campaign, "ukf", "ekf"),
         _most_expensive(costs),
     ]
-    reason = untested(config, FREE)
-    if reason is not None:
-        claims = [replace(claim, verdict="not testable", why=reason) for claim in claims]
-    return [*claims, _hammersley_spreads_better(config.seed)]
+    return [*judged(config, FREE, claims), _hammersley_spreads_better(config.seed)]
 
 
 def gain(campaign: Campaign, method: str, rival: str) -> Interval:
     """Return the change of RMSE, mean of the three angles, from a rival to a method."""
     squares = campaign.rows.mean_square.mean(axis=-1)
-    ratio = rmse_ratio(squares[:, METHODS.index(method)], squares[:, METHODS.index(rival)])
-    return Interval(*(bound - 1 for bound in ratio))
+    return rmse_change(squares[:, METHODS.index(method)], squares[:, METHODS.index(rival)])
 
 
 def _per_axis(campaign: Campaign, method: str, rival: str) -> list[Interval]:
     squares = campaign.rows.mean_square
     a, b = squares[:, METHODS.index(method)], squares[:, METHODS.index(rival)]
-    return [Interval(*(v - 1 for v in rmse_ratio(a[:, j], b[:, j]))) for j in range(len(AXES))]
+    return [rmse_change(a[:, j], b[:, j]) for j in range(len(AXES))]
 
 
 def _bank_beats_single(campaign: Campaign, bank: str, single: str) -> Claim:

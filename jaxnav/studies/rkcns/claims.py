@@ -1,13 +1,11 @@
 """The paper's tables and claims, and what became of them."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from jaxnav.estimation.metrics import Interval, mean_interval, rmse, rmse_ratio
+from jaxnav.estimation.metrics import Interval, mean_interval, rmse, rmse_change, rmse_ratio
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.studies.attitude import AXES
-from jaxnav.studies.base import Claim, untested, verdict
+from jaxnav.studies.base import Claim, judged, verdict
 from jaxnav.studies.rkcns.config import RkcnsConfig
 from jaxnav.studies.rkcns.cost import flops
 from jaxnav.studies.rkcns.methods import METHODS
@@ -74,15 +72,12 @@ def assess(config: RkcnsConfig, campaign: Campaign, costs: dict[str, float] | No
             *(_level(config, campaign, axis) for axis in AXES),
             _same_order(config, costs),
         ]
-    reason = untested(config, FREE)
-    if reason is None:
-        return claims
-    return [replace(claim, verdict="not testable", why=reason) for claim in claims]
+    return judged(config, FREE, claims)
 
 
 def change(campaign: Campaign, method: str, rival: str, axes: tuple[str, ...]) -> Interval:
     """Return the change of RMSE, of the norm over some components, from a rival to a method."""
-    return Interval(*(bound - 1 for bound in rmse_ratio(*_squares(campaign, method, rival, axes))))
+    return rmse_change(*_squares(campaign, method, rival, axes))
 
 
 def _squares(
