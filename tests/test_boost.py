@@ -7,7 +7,7 @@ import numpy as np
 from oracles import rotations, sins
 from oracles.matrices import central_difference
 
-from jaxnav.navigation.strapdown import mechanise_launch_inertial
+from jaxnav.navigation.strapdown.launch_inertial import mechanise_launch_inertial
 from jaxnav.navigation.trajectory.boost import BoostProfile, fly_boost, pitch
 from jaxnav.units import ARCSEC, DEG
 

@@ -9,7 +9,8 @@ from jaxnav.navigation import earth
 from jaxnav.units import DEG
 
 RADIUS = 6.371e6
-A, B = earth.WGS84_A, earth.WGS84_A * (1 - earth.WGS84_F)
+A = earth.WGS84.semi_major
+B = A * (1 - earth.WGS84.flattening)
 # Latitude, longitude [deg] and height [m]: ordinary points, both poles, the antimeridian.
 PLACES = np.array(
     [
@@ -66,7 +67,7 @@ def test_small_offsets_are_east_north_up():
         return jax.jacfwd(earth.enu_from_geodetic)(origin, origin)
 
     latitude, height = PLACES[:, 0], PLACES[:, 2]
-    normal = A / np.sqrt(1 - earth.WGS84_E2 * np.sin(latitude) ** 2)
+    normal = A / np.sqrt(1 - earth.WGS84.eccentricity2 * np.sin(latitude) ** 2)
     expected = np.zeros((len(PLACES), 3, 3))
     expected[:, 0, 1] = (normal + height) * np.cos(latitude)
     expected[:, 1, 0] = earth.meridian_radius(jnp.asarray(latitude)) + height

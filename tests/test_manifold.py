@@ -26,7 +26,9 @@ from jaxnav.navigation.models.sins_total import (
     retract,
     sins_total,
 )
-from jaxnav.navigation.strapdown import NavState, accumulate, mechanise_launch_inertial
+from jaxnav.navigation.strapdown.base import NavState
+from jaxnav.navigation.strapdown.increments import accumulate
+from jaxnav.navigation.strapdown.launch_inertial import mechanise_launch_inertial
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
 from jaxnav.numerics.lie import dcm_from_euler, so3_exp, so3_log
 from jaxnav.numerics.sigma import SigmaRule, cubature, unscented

@@ -14,7 +14,8 @@ from jaxnav.navigation.models.sins_cns import (
     sins_cns,
     sins_cns_attitude,
 )
-from jaxnav.navigation.strapdown import NavSolution, NavState
+from jaxnav.navigation.strapdown.base import NavState
+from jaxnav.navigation.strapdown.launch_inertial import NavSolution
 from jaxnav.numerics.lie import so3_local
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 

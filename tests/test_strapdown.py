@@ -13,12 +13,9 @@ from jaxnav.navigation.models.sins_cns import (
     inputs_from_solution,
     sins_cns,
 )
-from jaxnav.navigation.strapdown import (
-    NavSolution,
-    NavState,
-    mechanise_launch_inertial,
-    rotation_compensated,
-)
+from jaxnav.navigation.strapdown.base import NavState
+from jaxnav.navigation.strapdown.increments import rotation_compensated
+from jaxnav.navigation.strapdown.launch_inertial import NavSolution, mechanise_launch_inertial
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
 from jaxnav.numerics.lie import so3_exp, so3_local
 from jaxnav.units import ARCSEC

@@ -154,12 +154,19 @@ class FilterParams(NamedTuple):
             that the filter was built with.
         search: :class:`~jaxnav.estimation.filters.iterated.Search` of an iterated filter; ``()`` is
             the one that the filter was built with.
+        kernel: :class:`~jaxnav.estimation.filters.robust.Versoria` or
+            :class:`~jaxnav.estimation.filters.robust.Correntropy` of a robust filter; ``()`` is the
+            default of its class.
+        adaptation: :class:`~jaxnav.estimation.filters.adaptive.Adaptation` of an adaptive filter;
+            ``()`` is the default.
     """
 
     model: Params
     initial: Gaussian
     sigma: Any = ()
     search: Any = ()
+    kernel: Any = ()
+    adaptation: Any = ()
 
 
 class Filter(NamedTuple):

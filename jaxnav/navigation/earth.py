@@ -1,26 +1,132 @@
-"""The Earth: WGS84, point-mass gravity in the launch-inertial frame, and local level frames."""
+"""The Earth: WGS84 with its gravity, point-mass gravity, local level frames and their rates."""
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.numerics.lie import wrapped_angle
 from jaxnav.numerics.linalg import safe_norm
+from jaxnav.units import STANDARD_GRAVITY
 
 GM = 3.986004418e14
 """Gravitational parameter [m^3/s^2] (WGS84)."""
-WGS84_A = 6378137.0
-"""Semi-major axis [m]."""
-WGS84_F = 1 / 298.257223563
-"""Flattening [-]."""
-WGS84_E2 = WGS84_F * (2 - WGS84_F)
-"""First eccentricity squared [-]."""
 MEAN_RADIUS = 6.371e6
 """Radius [m] of the spherical Earth that stands for the ellipsoid where its shape is no matter."""
 
 
-def meridian_radius(latitude: Array | float) -> Array:
+class Earth(NamedTuple):
+    """An ellipsoid of revolution that turns, with its normal gravity; the default is WGS84.
+
+    Attributes:
+        semi_major: Equatorial radius ``a`` [m].
+        flattening: ``f``.
+        rate: Rate of rotation [rad/s].
+        gravity: Normal gravity at the equator [m/s^2].
+        growth: Somigliana's constant ``k``, the growth of gravity to the poles.
+        centrifugal: ``m = rate^2 a^2 b / GM``, the centrifugal share at the equator.
+
+    References:
+        NGA (2014), World Geodetic System 1984, NGA.STND.0036.
+    """
+
+    semi_major: float = 6378137.0
+    flattening: float = 1 / 298.257223563
+    rate: float = 7.292115e-5
+    gravity: float = 9.7803253359
+    growth: float = 0.00193185265241
+    centrifugal: float = 0.00344978650684
+
+    @property
+    def eccentricity2(self) -> float:
+        """First eccentricity squared."""
+        return self.flattening * (2 - self.flattening)
+
+
+WGS84 = Earth()
+FLAT = Earth(1e18, 0.0, 0.0, STANDARD_GRAVITY, 0.0, 0.0)
+"""An Earth that neither turns nor curves, for what holds only there: a sphere so large that near
+latitude and longitude zero the local level frame turns by less than 1e-14 rad/s."""
+
+
+def meridian_radius(latitude: Array | float, earth: Earth = WGS84) -> Array:
     """Return the radius of curvature of the meridian [m] at a geodetic latitude [rad]."""
+    e2 = earth.eccentricity2
+    return earth.semi_major * (1 - e2) / (1 - e2 * jnp.sin(latitude) ** 2) ** 1.5
+
+
+def transverse_radius(latitude: Array | float, earth: Earth = WGS84) -> Array:
+    """Return the radius of curvature of the prime vertical [m] at a geodetic latitude [rad]."""
+    return earth.semi_major / jnp.sqrt(1 - earth.eccentricity2 * jnp.sin(latitude) ** 2)
+
+
+def normal_gravity(latitude: Array | float, height: Array | float, earth: Earth = WGS84) -> Array:
+    """Return normal gravity [m/s^2], downward along the ellipsoid's normal.
+
+    Somigliana's formula on the ellipsoid, of second order in the height above it:
+
+        g0 = g_e (1 + k sin^2 L) / sqrt(1 - e^2 sin^2 L)
+        g = g0 (1 - 2 (1 + f + m - 2 f sin^2 L) h / a + 3 h^2 / a^2)
+
+    Args:
+        latitude: Geodetic latitude ``L`` [rad].
+        height: Ellipsoidal height ``h`` [m].
+        earth: The Earth.
+
+    References:
+        Groves (2013), Eqs. (2.134) and (2.139), whose northward part, 8e-9 h m/s^2, is left out.
+    """
     s2 = jnp.sin(latitude) ** 2
-    return WGS84_A * (1 - WGS84_E2) / (1 - WGS84_E2 * s2) ** 1.5
+    surface = earth.gravity * (1 + earth.growth * s2) / jnp.sqrt(1 - earth.eccentricity2 * s2)
+    f, relative = earth.flattening, height / earth.semi_major
+    slope = 2 * (1 + f + earth.centrifugal - 2 * f * s2)
+    return surface * (1 - slope * relative + 3 * relative**2)
+
+
+def earth_rate(latitude: Array, earth: Earth = WGS84) -> Array:
+    """Return the Earth's rate ``(3,) [rad/s]`` in east, north, up."""
+    zero = jnp.zeros_like(latitude)
+    return earth.rate * jnp.stack([zero, jnp.cos(latitude), jnp.sin(latitude)])
+
+
+def metres_per_radian(position: Array, earth: Earth = WGS84) -> Array:
+    """Return ``(3,)`` the metres north, east and up of a unit of latitude, longitude and height."""
+    latitude, height = position[0], position[2]
+    north = meridian_radius(latitude, earth) + height
+    east = (transverse_radius(latitude, earth) + height) * jnp.cos(latitude)
+    return jnp.stack([north, east, jnp.ones_like(height)])
+
+
+def transport_rate(position: Array, velocity: Array, earth: Earth = WGS84) -> Array:
+    """Return the rate ``(3,) [rad/s]`` at which east, north, up turn as the vehicle moves.
+
+    ``w_en = (-v_N / (R_M + h), v_E / (R_N + h), v_E tan L / (R_N + h))``; singular at the poles.
+
+    Args:
+        position: Latitude, longitude [rad], height [m].
+        velocity: East, north, up ``(3,) [m/s]``.
+        earth: The Earth.
+    """
+    latitude, height = position[0], position[2]
+    east = velocity[0] / (transverse_radius(latitude, earth) + height)
+    north = velocity[1] / (meridian_radius(latitude, earth) + height)
+    return jnp.stack([-north, east, east * jnp.tan(latitude)])
+
+
+def displaced(position: Array, offset: Array, earth: Earth = WGS84) -> Array:
+    """Return the geodetic position an offset ``(3,) [m]`` east, north, up away, to first order."""
+    return position + offset[jnp.array([1, 0, 2])] / metres_per_radian(position, earth)
+
+
+def offset_between(position: Array, other: Array, earth: Earth = WGS84) -> Array:
+    """Return east, north, up ``(3,) [m]`` from a geodetic position to another one near.
+
+    Inverse of :func:`displaced`; the difference of longitudes is taken within half a turn.
+    """
+    difference = other - position
+    turn = wrapped_angle(other[1], position[1])
+    metres = metres_per_radian(position, earth) * difference.at[1].set(turn)
+    return metres[jnp.array([1, 0, 2])]
 
 
 def gravity_launch_inertial(r: Array, radius: Array | float) -> Array:
@@ -53,12 +159,12 @@ def ecef_from_geodetic(geodetic: Array) -> Array:
     """Return the Earth-fixed position ``(3,) [m]`` of latitude, longitude [rad] and height [m]."""
     latitude, longitude, height = geodetic[0], geodetic[1], geodetic[2]
     s, c = jnp.sin(latitude), jnp.cos(latitude)
-    normal = WGS84_A / jnp.sqrt(1 - WGS84_E2 * s * s)
+    normal = transverse_radius(latitude)
     return jnp.stack(
         [
             (normal + height) * c * jnp.cos(longitude),
             (normal + height) * c * jnp.sin(longitude),
-            (normal * (1 - WGS84_E2) + height) * s,
+            (normal * (1 - WGS84.eccentricity2) + height) * s,
         ]
     )
 

@@ -80,6 +80,21 @@ def so3_left_jacobian(phi: Array) -> Array:
     return jnp.eye(3, dtype=phi.dtype) + half * skew(phi) + cubic * _skew_squared(phi)
 
 
+def so3_left_jacobian_inverse(phi: Array) -> Array:
+    """Return the inverse ``(3, 3)`` of :func:`so3_left_jacobian`, for angles below a full turn.
+
+    ``I - [phi]x / 2 + (1 - a/2 cot(a/2)) / a^2 [phi]x^2``.
+    """
+    squared = jnp.sum(phi * phi)
+    small = squared < _taylor_angle(phi.dtype) ** 2
+    safe = jnp.where(small, 1, squared)
+    half = 0.5 * jnp.sqrt(safe)
+    closed = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
+    series = 1 / 12 + squared / 720 * (1 + squared / 42 * (1 + squared / 40))
+    second = jnp.where(small, series, closed)
+    return jnp.eye(3, dtype=phi.dtype) - 0.5 * skew(phi) + second * _skew_squared(phi)
+
+
 def so3_log(C: Array) -> Array:
     """Return the rotation vector ``(3,) [rad]`` of a rotation matrix ``(3, 3)``, norm at most pi.
 
@@ -162,8 +177,12 @@ def euler_from_dcm(C: Array) -> Array:
 
 
 def wrapped_angle(z: Array, reference: Array) -> Array:
-    """Return the differences ``z - reference`` of angles [rad], in [-pi, pi)."""
-    return jnp.mod(z - reference + jnp.pi, 2 * jnp.pi) - jnp.pi
+    """Return the differences ``z - reference`` of angles [rad], in [-pi, pi).
+
+    Differences within that are returned as they are, without the rounding of a remainder.
+    """
+    difference = z - reference
+    return difference - 2 * jnp.pi * jnp.floor((difference + jnp.pi) / (2 * jnp.pi))
 
 
 def euler_error_from_rotation(C: Array) -> Array:

@@ -77,7 +77,7 @@ class SinsTotalInput(NamedTuple):
     Attributes:
         dtheta: ``(3,) [rad]`` rotation vector of the body over the period.
         dvel: ``(3,) [m/s]`` integral of the specific force in the body axes of the period's start
-            (see :func:`~jaxnav.navigation.strapdown.accumulate`).
+            (see :func:`~jaxnav.navigation.strapdown.increments.accumulate`).
         true_scale: True factor on the variances of both noises, for an informed filter only.
     """
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.navigation.strapdown import NavState
+from jaxnav.navigation.strapdown.base import NavState
 
 
 class Trajectory(NamedTuple):
@@ -13,7 +13,7 @@ class Trajectory(NamedTuple):
 
     Attributes:
         time: ``(N + 1,) [s]``.
-        state: :class:`~jaxnav.navigation.strapdown.NavState`, leading axis ``N + 1``.
+        state: :class:`~jaxnav.navigation.strapdown.base.NavState`, leading axis ``N + 1``.
         dtheta: ``(N, 3) [rad]`` rotation vectors of the body over each interval.
         dvel: ``(N, 3) [m/s]`` integrals of the specific force in body axes.
     """

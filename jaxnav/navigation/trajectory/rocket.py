@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.navigation.earth import gravity_launch_inertial
-from jaxnav.navigation.strapdown import NavState
+from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.trajectory.base import Trajectory, simpson, smooth_step
 from jaxnav.numerics.lie import dcm_from_euler, so3_log
 from jaxnav.numerics.ode import rk4

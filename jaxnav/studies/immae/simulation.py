@@ -17,12 +17,9 @@ from jaxnav.navigation.models.sins_cns import (
 )
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
 from jaxnav.navigation.sensors.star import observe_attitude
-from jaxnav.navigation.strapdown import (
-    NavSolution,
-    NavState,
-    mechanise_launch_inertial,
-    rotation_compensated,
-)
+from jaxnav.navigation.strapdown.base import NavState
+from jaxnav.navigation.strapdown.increments import rotation_compensated
+from jaxnav.navigation.strapdown.launch_inertial import NavSolution, mechanise_launch_inertial
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
 from jaxnav.numerics.lie import euler_error_from_rotation, so3_exp, so3_local

@@ -17,7 +17,8 @@ from jaxnav.navigation.models.sins_total import (
 )
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt, markov_error
 from jaxnav.navigation.sensors.star import observe_attitude
-from jaxnav.navigation.strapdown import NavState, accumulate
+from jaxnav.navigation.strapdown.base import NavState
+from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.boost import BoostProfile, fly_boost
 from jaxnav.numerics.lie import euler_from_dcm, so3_log

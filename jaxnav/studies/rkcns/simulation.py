@@ -27,7 +27,7 @@ from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
 from jaxnav.navigation.sensors.refraction import Camera, measure, pick, view
 from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.stars import StarCatalogue, brighter, dcm_launch_icrs, directions
-from jaxnav.navigation.strapdown import accumulate
+from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
 from jaxnav.studies.base import require

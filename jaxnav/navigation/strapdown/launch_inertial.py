@@ -1,4 +1,4 @@
-"""Strapdown mechanisation: attitude, velocity and position from inertial increments."""
+"""Mechanisation in the non-rotating launch-inertial frame, about a point-mass Earth."""
 
 from typing import NamedTuple
 
@@ -7,16 +7,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.navigation.earth import gravity_launch_inertial
-from jaxnav.numerics.lie import so3_exp, so3_log
+from jaxnav.navigation.strapdown.base import NavState, require_periods
+from jaxnav.navigation.strapdown.increments import rotation_compensated
+from jaxnav.numerics.lie import so3_exp
 from jaxnav.numerics.linalg import matmul
-
-
-class NavState(NamedTuple):
-    """Navigation state: ``dcm`` C_ib ``(3, 3)``, velocity ``(3,) [m/s]``, position ``(3,) [m]``."""
-
-    dcm: Array
-    velocity: Array
-    position: Array
 
 
 class NavSolution(NamedTuple):
@@ -30,51 +24,6 @@ class NavSolution(NamedTuple):
 
     state: NavState
     specific_velocity: Array
-
-
-def rotation_compensated(dtheta: Array, dvel: Array) -> Array:
-    """Return the velocity increment ``(3,) [m/s]`` in the body axes of the start of the interval.
-
-    ``dv + dtheta x dv / 2`` accounts for the rotation of the body within the interval.
-    """
-    return dvel + 0.5 * jnp.cross(dtheta, dvel)
-
-
-def accumulate(dtheta: Array, dvel: Array, every: int) -> tuple[Array, Array]:
-    """Condense inertial increments into one pair per period of ``every`` intervals.
-
-    The rotation vector is that of the product of the rotations; the velocity increments are turned
-    into the body axes of the period's start and summed, so that a filter at a lower rate loses
-    neither coning nor sculling.
-
-    Args:
-        dtheta: ``(N, 3) [rad]`` rotation vectors of the body over each interval.
-        dvel: ``(N, 3) [m/s]`` integrals of the specific force in body axes.
-        every: Intervals in a period; ``N`` must be a multiple.
-
-    Returns:
-        ``(N / every, 3)`` rotation vectors [rad] and velocity increments [m/s].
-
-    Raises:
-        ValueError: If ``N`` is not a multiple of ``every``.
-    """
-    if dtheta.shape[0] % every:
-        raise ValueError(f"{dtheta.shape[0]} increments do not divide into periods of {every}")
-    rotations = jax.vmap(so3_exp)(dtheta).reshape(-1, every, 3, 3)
-    gained = jax.vmap(rotation_compensated)(dtheta, dvel).reshape(-1, every, 3)
-    multiply = jax.vmap(matmul)
-
-    def interval(
-        carry: tuple[Array, Array], now: tuple[Array, Array]
-    ) -> tuple[tuple[Array, Array], None]:
-        turned, total = carry
-        rotation, gain = now
-        return (multiply(turned, rotation), total + multiply(turned, gain)), None
-
-    start = (rotations[:, 0], gained[:, 0])
-    later = (jnp.swapaxes(rotations[:, 1:], 0, 1), jnp.swapaxes(gained[:, 1:], 0, 1))
-    (turned, total), _ = jax.lax.scan(interval, start, later)
-    return jax.vmap(so3_log)(turned), total
 
 
 def mechanise_launch_inertial(
@@ -108,8 +57,7 @@ def mechanise_launch_inertial(
     References:
         Titterton and Weston (2004), ch. 11; Shi, Chen, Wang (2023), Eqs. (34)-(36).
     """
-    if dtheta.shape[0] % every:
-        raise ValueError(f"{dtheta.shape[0]} increments do not divide into periods of {every}")
+    require_periods(dtheta.shape[0], every)
     rotations = jax.vmap(so3_exp)(dtheta)
     gained = jax.vmap(rotation_compensated)(dtheta, dvel)
 

@@ -1,0 +1,47 @@
+"""A model whose noise is handed to it, for filters that estimate noise or reweigh their data."""
+
+from typing import NamedTuple
+
+from jax import Array
+
+from jaxnav.estimation.types import FilterParams, Input, Model, NonAdditive, Params, Point
+
+
+class GivenNoise(NamedTuple):
+    """Parameters of a model under :func:`with_given_noise`.
+
+    Attributes:
+        own: The model's own parameters.
+        process: Factor on its process noise.
+        observation: ``(m, m)`` covariance, or its diagonal ``(m,)``, in place of its own.
+    """
+
+    own: Params
+    process: Array | float
+    observation: Array | float
+
+
+def with_given_noise(model: Model) -> Model:
+    """Return the model with parameters :class:`GivenNoise`; all else is as it was."""
+    noisy, jacobians = model.noisy, model.jacobians
+
+    def process_noise(params: GivenNoise, x: Point, u: Input) -> Array:
+        return params.process * model.process_noise(params.own, x, u)
+
+    return model._replace(
+        transition=lambda params, x, u: model.transition(params.own, x, u),
+        process_noise=process_noise,
+        observe=lambda params, x, u: model.observe(params.own, x, u),
+        observation_noise=lambda params, x, u: params.observation,
+        jacobians=jacobians and (lambda params, x, u: jacobians(params.own, x, u)),
+        noisy=noisy
+        and NonAdditive(
+            lambda params, x, v, u: noisy.observe(params.own, x, v, u),
+            lambda params, x, u: noisy.noise(params.own, x, u),
+        ),
+    )
+
+
+def given(params: FilterParams, process: Array | float, observation: Array | float) -> FilterParams:
+    """Return a filter's parameters with the noise handed to its model."""
+    return params._replace(model=GivenNoise(params.model, process, observation))

@@ -1,0 +1,130 @@
+"""Robust filters: an update whose measurement noise grows where residuals are out of the ordinary.
+
+With ``R = L L'``, the whitened residual at an estimate ``x`` is ``e = inv(L) (z - h(x))``. Each
+channel gets the weight ``w(e)`` of a kernel, and the update is made anew from the same prior with
+``R = L diag(1 / w) L'``, a fixed number of times. The first estimate is that of the plain update:
+with the prior's, as in the papers, a good measurement that corrects a poor prior would look like an
+outlier and be thrown away.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.filters.given_noise import given, with_given_noise
+from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation
+from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
+from jaxnav.numerics.linalg import cholesky, matmul, solve_lower
+
+Builder = Callable[[Model], Filter]
+"""A filter of a model, such as :func:`~jaxnav.estimation.filters.kalman.ekf`."""
+LEAST_WEIGHT = 1e-8
+"""Smallest weight of a channel: it is then as good as not there, and its noise still finite."""
+
+
+class Versoria(NamedTuple):
+    """Parameters of :func:`versoria`.
+
+    Attributes:
+        width: ``tau``, zero or above; with zero all weights are one.
+        power: ``p``, above zero: how fast weights fall.
+    """
+
+    width: Array | float = 0.05
+    power: Array | float = 2.0
+
+
+class Correntropy(NamedTuple):
+    """Parameters of :func:`correntropy`.
+
+    Attributes:
+        bandwidth: Width of the Gaussian kernel in standard deviations; infinite, all weights are
+            one.
+    """
+
+    bandwidth: Array | float = 3.0
+
+
+def versoria(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
+    """Return a filter under the maximum Versoria criterion, ``w = 1 / (1 + tau |e|^p)^2``.
+
+    For ``p = 2`` that is the derivative of ``V = 1 / (1 + tau e^2)`` over ``e``, up to a factor;
+    another power changes the weight itself, since the derivative of ``V`` would then be singular
+    or vanish at zero. Parameters are :class:`~jaxnav.estimation.types.FilterParams` with
+    :class:`Versoria` as ``kernel``.
+
+    Args:
+        build: The filter to make robust; any of this library that takes a model.
+        model: The model.
+        iterations: Number of reweighted updates.
+
+    Raises:
+        ValueError: If there is no iteration.
+
+    References:
+        Huang, Zhang, Xu, Wu, Chambers (2017) for reweighting by fixed-point iteration; Zhao et al.
+        (2022), as cited by Yang et al. (2025), for the criterion. Both also reweigh the prior,
+        which is not done here.
+    """
+    return _reweighted(build, model, _versoria_weight, Versoria(), iterations)
+
+
+def correntropy(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
+    """Return a filter under the maximum correntropy criterion, ``w = exp(-e^2 / (2 sigma^2))``.
+
+    Parameters are :class:`~jaxnav.estimation.types.FilterParams` with :class:`Correntropy` as
+    ``kernel``; arguments and errors are those of :func:`versoria`.
+
+    References:
+        Chen, Liu, Zhao, Principe (2017), Automatica 76, who also reweigh the prior.
+    """
+    return _reweighted(build, model, _correntropy_weight, Correntropy(), iterations)
+
+
+def _versoria_weight(kernel: Versoria, squared: Array) -> Array:
+    somewhere = squared > 0
+    powered = jnp.exp(0.5 * kernel.power * jnp.log(jnp.where(somewhere, squared, 1)))
+    return (1 + kernel.width * jnp.where(somewhere, powered, 0)) ** -2
+
+
+def _correntropy_weight(kernel: Correntropy, squared: Array) -> Array:
+    return jnp.exp(-0.5 * squared / jnp.asarray(kernel.bandwidth, squared.dtype) ** 2)
+
+
+def _reweighted(
+    build: Builder,
+    model: Model,
+    weight: Callable[[Any, Array], Array],
+    default: Any,
+    iterations: int,
+) -> Filter:
+    """Return a filter whose update is made anew with weights from its own residuals.
+
+    The info is that of the plain update, so that its likelihood and NIS tell of the data as the
+    model has them; flags of the reweighted updates are added.
+    """
+    if iterations < 1:
+        raise ValueError(f"iterations is {iterations}; a robust update needs at least 1")
+    base = build(with_given_noise(model))
+
+    def predict(params: FilterParams, state: Any, u: Input) -> Any:
+        return base.predict(given(params, 1.0, 0.0), state, u)
+
+    def update(params: FilterParams, state: Any, u: Input, obs: Obs) -> tuple[Any, Info]:
+        kernel = default if params.kernel == () else params.kernel
+        x = base.estimate(state).mean
+        R = mask_noise(model.observation_noise(params.model, x, u), obs.valid)
+        L = cholesky(R).factor
+        moved, info = base.update(given(params, 1.0, R), state, u, obs)
+        flags = info.flags
+        for _ in range(iterations):
+            seen = model.observe(params.model, base.estimate(moved).mean, u)
+            e = solve_lower(L, masked_innovation(model, obs, seen))
+            w = jnp.maximum(weight(kernel, e * e), LEAST_WEIGHT)
+            moved, again = base.update(given(params, 1.0, matmul(L / w, L.T)), state, u, obs)
+            flags = flags | again.flags
+        return moved, info._replace(iterations=info.iterations + iterations, flags=flags)
+
+    return base._replace(predict=predict, update=update)

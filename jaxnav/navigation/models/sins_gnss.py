@@ -1,0 +1,251 @@
+"""Strapdown inertial system in the local level frame, aided by positions and velocities of GNSS.
+
+The state is the navigation solution itself, driven by inertial increments: attitude C_nb, velocity,
+geodetic position, gyro drift and accelerometer bias (measured minus true). How its error is
+defined is a choice (:mod:`~jaxnav.navigation.models.level_errors`), and with it one extended Kalman
+filter is the usual error-state filter, the left-invariant one or that on SE_2(3).
+
+References:
+    Yang et al. (2025), "Adaptive filter parameter reconstruction technology for rocket inertial
+    navigation/satellite integrated navigation system", PeerJ Computer Science 11:e3040, Eqs.
+    (1)-(11) and (17), all of them images that are not available: the equations here are the
+    standard ones, Groves (2013), chapters 5 and 14.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.types import Model
+from jaxnav.navigation.earth import (
+    WGS84,
+    Earth,
+    displaced,
+    earth_rate,
+    metres_per_radian,
+    offset_between,
+    transport_rate,
+)
+from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
+from jaxnav.navigation.models.sins_cns import LAYOUT
+from jaxnav.navigation.strapdown.base import NavState
+from jaxnav.navigation.strapdown.local_level import level_step, pull
+from jaxnav.numerics.lie import so3_exp, so3_left_jacobian
+from jaxnav.numerics.linalg import matmul
+
+CHANNELS = ("vel_e", "vel_n", "vel_u", "pos_e", "pos_n", "pos_u")
+"""Channels of the residual, in order; an observation has latitude, longitude, height in the last
+three places."""
+
+
+class SinsGnssParams(NamedTuple):
+    """Noise of the model, each ``(3,)``, and where the antenna is.
+
+    Attributes:
+        gyro_noise: Angle random walk ``N_g`` [rad/sqrt(s)], body axes.
+        accel_noise: Velocity random walk ``N_a`` [m/s/sqrt(s)], body axes.
+        gyro_walk: Random walk of the gyro drift [rad/s/sqrt(s)].
+        accel_walk: Random walk of the accelerometer bias [m/s^2/sqrt(s)].
+        velocity_noise: Standard deviation of a GNSS velocity [m/s], east, north, up.
+        position_noise: Standard deviation of a GNSS position [m], east, north, up.
+        lever_arm: From the inertial sensors to the antenna [m], body axes.
+    """
+
+    gyro_noise: Array
+    accel_noise: Array
+    gyro_walk: Array
+    accel_walk: Array
+    velocity_noise: Array
+    position_noise: Array
+    lever_arm: Array
+
+
+class SinsGnssInput(NamedTuple):
+    """What the inertial sensors report over one filter period.
+
+    Attributes:
+        dtheta: ``(3,) [rad]`` rotation vector of the body over the period.
+        gain: ``(3,) [m/s]`` integral of the specific force in the body axes of the period's start
+            (see :func:`~jaxnav.navigation.strapdown.increments.accumulate`).
+        rate: ``(3,) [rad/s]`` angular rate at the end of the period, for the lever arm.
+        dt: Length of the period [s]; with zero or less nothing moves and no noise is added.
+    """
+
+    dtheta: Array
+    gain: Array
+    rate: Array
+    dt: Array
+
+
+def sins_gnss(
+    error: LevelError = "additive", origin: Array | None = None, earth: Earth = WGS84
+) -> Model:
+    """Return the 15-state model, driven by the increments of one filter period.
+
+        attitude, velocity, position by :func:`~jaxnav.navigation.strapdown.local_level.level_step`
+        with dtheta - T eps,  gain - T (nabla + eps x gain / 2)
+        Q = diag(N_g^2, N_a^2, 0, K_g^2, K_a^2) T  in body axes, turned into the error's
+        z = (v + C (w x l) - w_ie x C l,  p + C l)
+
+    The residual of a position is in metres, of first order in the distance.
+
+    Args:
+        error: The definition of the error.
+        origin: Geodetic position about which the right-invariant error turns.
+        earth: The Earth.
+
+    Returns:
+        A model with :class:`SinsGnssParams` and :class:`SinsGnssInput`, six channels
+        (:data:`CHANNELS`) and analytic Jacobians, in which terms of a relative size of
+        ``(w_ie + w_en) T`` next to others in the same block are left out.
+
+    Raises:
+        ValueError: If the error is not a known one, or the right-invariant one has no origin.
+    """
+    if error == "right-invariant" and origin is None:
+        raise ValueError("the right-invariant error turns about an origin; give a position")
+    form = error_form(error, jnp.zeros(3) if origin is None else origin, earth)
+
+    def transition(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> SinsLevel:
+        del params
+        return _advanced(x, u, earth)
+
+    def process_noise(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
+        return _process_noise(form, params, x, u)
+
+    def observe(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
+        arm = matmul(x.dcm, params.lever_arm)
+        swung = matmul(x.dcm, jnp.cross(u.rate - x.drift, params.lever_arm))
+        carried = jnp.cross(earth_rate(x.position[0], earth), arm)
+        antenna = displaced(x.position, arm, earth)
+        return jnp.concatenate([x.velocity + swung - carried, antenna])
+
+    def observation_noise(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
+        del x, u
+        return jnp.concatenate([params.velocity_noise, params.position_noise]) ** 2
+
+    def residual(z: Array, z_pred: Array) -> Array:
+        return jnp.concatenate([z[:3] - z_pred[:3], offset_between(z_pred[3:], z[3:], earth)])
+
+    def jacobians(
+        params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput
+    ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+        ahead = _advanced(x, u, earth)
+        moved, seen = _transition_differential(x, ahead, u, earth), _seen(params, x, u)
+        return (
+            lambda dx: form.from_additive(ahead, moved(form.to_additive(x, dx))),
+            lambda dx: seen(form.to_additive(x, dx)),
+        )
+
+    return Model(
+        transition,
+        process_noise,
+        observe,
+        observation_noise,
+        residual,
+        form.retract,
+        form.local,
+        jacobians,
+    )
+
+
+def _length(u: SinsGnssInput) -> Array:
+    return jnp.maximum(u.dt, 0)
+
+
+def _corrected(x: SinsLevel, u: SinsGnssInput) -> tuple[Array, Array]:
+    """Return rotation vector and gain less what the state says is error; none without a period.
+
+    A drift also turns the axes in which the gains of the period were summed.
+    """
+    dt, live = _length(u), u.dt > 0
+    turn = jnp.where(live, u.dtheta, 0) - dt * x.drift
+    gain = jnp.where(live, u.gain, 0)
+    return turn, gain - dt * (x.bias + 0.5 * jnp.cross(x.drift, gain))
+
+
+def _advanced(x: SinsLevel, u: SinsGnssInput, earth: Earth) -> SinsLevel:
+    turn, gain = _corrected(x, u)
+    moved = level_step(NavState(x.dcm, x.velocity, x.position), turn, gain, _length(u), earth)
+    return SinsLevel(*moved, x.drift, x.bias)
+
+
+def _process_noise(
+    form: ErrorForm, params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput
+) -> Array:
+    none = jnp.zeros((3, 3), x.bias.dtype)
+
+    def turned(sigma: Array) -> Array:
+        return matmul(x.dcm * (sigma**2)[None], x.dcm.T)
+
+    blocks = [
+        turned(params.gyro_noise),
+        turned(params.accel_noise),
+        none,
+        jnp.diag(params.gyro_walk**2),
+        jnp.diag(params.accel_walk**2),
+    ]
+    rows = [[own if i == j else none for j in range(5)] for i, own in enumerate(blocks)]
+    columns = jax.vmap(lambda d: form.from_additive(x, d), in_axes=1, out_axes=1)
+    return _length(u) * columns(columns(jnp.block(rows)).T)
+
+
+def _transition_differential(
+    x: SinsLevel, ahead: SinsLevel, u: SinsGnssInput, earth: Earth
+) -> Callable[[Array], Array]:
+    """Return the derivative of the transition in additive errors as a function of ``(15,)``."""
+    s, dt = LAYOUT, _length(u)
+    turn, gain = _corrected(x, u)
+    raw = jnp.where(u.dt > 0, u.gain, 0)
+    felt = matmul(x.dcm, gain)
+    turning = matmul(x.dcm, so3_left_jacobian(turn))
+    middle_p = displaced(x.position, 0.5 * dt * x.velocity, earth)
+    middle_v = 0.5 * (x.velocity + ahead.velocity)
+
+    def frame(offset: Array, velocity: Array) -> tuple[Array, Array]:
+        place = displaced(middle_p, offset, earth)
+        rate = earth_rate(place[0], earth) + transport_rate(place, velocity, earth)
+        return dt * rate, dt * pull(place, velocity, earth)
+
+    (turned, _), slope = jax.linearize(frame, jnp.zeros_like(middle_v), middle_v)
+    back = so3_exp(-turned)
+    north_east_up = metres_per_radian(ahead.position, earth) / metres_per_radian(x.position, earth)
+    stretch = north_east_up[jnp.array([1, 0, 2])]
+
+    def moved(d: Array) -> Array:
+        sensed = d[s.nabla] + 0.5 * jnp.cross(d[s.eps], raw)
+        df = jnp.cross(d[s.phi], felt) - dt * matmul(x.dcm, sensed)
+        dturn, dpull = slope(d[s.dr] + 0.5 * dt * d[s.dv], d[s.dv] + 0.5 * df)
+        gained = df - 0.5 * (jnp.cross(turned, df) + jnp.cross(dturn, felt)) + dpull
+        return jnp.concatenate(
+            [
+                matmul(back, d[s.phi] - dt * matmul(turning, d[s.eps])) - dturn,
+                d[s.dv] + gained,
+                stretch * d[s.dr] + dt * (d[s.dv] + 0.5 * gained),
+                d[s.eps],
+                d[s.nabla],
+            ]
+        )
+
+    return moved
+
+
+def _seen(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Callable[[Array], Array]:
+    """Return the derivative of the observation in additive errors as a function of ``(15,)``."""
+    s = LAYOUT
+    arm = matmul(x.dcm, params.lever_arm)
+    swung = matmul(x.dcm, jnp.cross(u.rate - x.drift, params.lever_arm))
+
+    def seen(d: Array) -> Array:
+        drifted = matmul(x.dcm, jnp.cross(d[s.eps], params.lever_arm))
+        return jnp.concatenate(
+            [
+                d[s.dv] + jnp.cross(d[s.phi], swung) - drifted,
+                d[s.dr] + jnp.cross(d[s.phi], arm),
+            ]
+        )
+
+    return seen

@@ -1,0 +1,1 @@
+"""Strapdown mechanisation: attitude, velocity and position from inertial increments."""
