@@ -1,4 +1,4 @@
-"""Command line: ``jaxnav list | run | doctor``.
+"""Command line: ``jaxnav list | run | allan | doctor``.
 
 Imports of JAX and the studies wait until a command needs them, so that help is immediate.
 """
@@ -12,7 +12,7 @@ from typing import Any
 
 from jaxnav.datasets.base import DataError
 from jaxnav.studies import STUDIES
-from jaxnav.studies.base import ConfigError, StudyResult
+from jaxnav.studies.base import ConfigError, StudyResult, require_x64
 
 OK, BAD_INPUT, DIVERGED, INTERRUPTED = 0, 2, 3, 130
 
@@ -24,6 +24,7 @@ A differentiable filter bank for aided inertial navigation.
 commands:
   list          studies with their scenarios, filters, weight rules
   run STUDY     run a study; `jaxnav run STUDY --help` lists its parameters
+  allan LOG     noise coefficients of an inertial sensor from a log at rest
   doctor        versions, devices, 64-bit floats, compilation cache
 
 `jaxnav --version` prints the version.
@@ -60,6 +61,7 @@ def _dispatch(arguments: list[str]) -> int:
     commands: dict[str, Callable[[list[str]], int]] = {
         "list": _list,
         "run": _run,
+        "allan": _allan,
         "doctor": _doctor,
     }
     if command not in commands:
@@ -132,6 +134,38 @@ def _run(rest: list[str]) -> int:
     if parsed.json:
         print_json(results)
     return DIVERGED if any(result.diverged for result in results) else OK
+
+
+def _allan(rest: list[str]) -> int:
+    if not rest:
+        print("usage: jaxnav allan LOG [options]; `jaxnav allan --help` lists them")
+        return BAD_INPUT
+    asked = rest[0] in ("-h", "--help")
+    if rest[0].startswith("-") and not asked:
+        raise ConfigError(f"the log is not given; it must come before the options, not {rest[0]!r}")
+    from jaxnav.options import parse_allan
+
+    parsed = parse_allan(rest if asked else rest[1:])
+    if parsed is None:
+        return OK
+    configure_jax()
+    from jaxnav.noise_report.analysis import analyse, load
+    from jaxnav.noise_report.figures import draw
+    from jaxnav.report import print_allan, print_document
+    from jaxnav.results import claim_directory, finite_or_null, write_arrays, write_document
+
+    require_x64()
+    log = load(Path(rest[0]), parsed.config)
+    directory = claim_directory(parsed.out)
+    document, arrays = analyse(log, parsed.config)
+    write_arrays(arrays, directory / "allan.npz")
+    draw(arrays, parsed.config.confidence, directory / "allan.png")
+    write_document(document, directory / "summary.json")
+    if parsed.json:
+        print_document(finite_or_null(document))
+    else:
+        print_allan(document, directory)
+    return OK
 
 
 def configure_jax() -> None:

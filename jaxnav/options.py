@@ -1,4 +1,4 @@
-"""Options of a study on the command line, made from its configuration class by tyro."""
+"""Options on the command line, made from configuration classes by tyro."""
 
 import contextlib
 import io
@@ -9,18 +9,19 @@ from typing import Any, NamedTuple
 
 import tyro
 
+from jaxnav.noise_report.config import AllanConfig
 from jaxnav.studies.base import ConfigError
 
 
-class RunOptions(NamedTuple):
-    """What ``jaxnav run STUDY`` was asked for."""
+class Options(NamedTuple):
+    """What a command was asked for."""
 
     config: Any
     out: Path
     json: bool
 
 
-def parse_run(study: str, config: type, arguments: list[str]) -> RunOptions | None:
+def parse_run(study: str, config: type, arguments: list[str]) -> Options | None:
     """Parse the options of ``jaxnav run STUDY``.
 
     Args:
@@ -34,23 +35,36 @@ def parse_run(study: str, config: type, arguments: list[str]) -> RunOptions | No
     Raises:
         ConfigError: With one sentence on what was wrong and what is accepted.
     """
+    files = "summary.json, arrays.npz and the figures"
+    return _parse(f"jaxnav run {study}", config, Path("results") / study, files, arguments)
+
+
+def parse_allan(arguments: list[str]) -> Options | None:
+    """Parse the options of ``jaxnav allan LOG``, those after the log; as :func:`parse_run`."""
+    files = "summary.json, allan.npz and allan.png"
+    return _parse("jaxnav allan LOG", AllanConfig, Path("results") / "allan", files, arguments)
+
+
+def _parse(
+    program: str, config: type, out: Path, files: str, arguments: list[str]
+) -> Options | None:
+    """Parse the fields of a configuration, ``--out`` and ``--json``."""
     options = make_dataclass(
         "Options",
         [
             ("config", tyro.conf.OmitArgPrefixes[config], field(default_factory=config)),
-            ("out", Path, field(default=Path("results") / study)),
+            ("out", Path, field(default=out)),
             ("json", bool, field(default=False)),
         ],
         frozen=True,
     )
     options.__doc__ = (
-        f"{(config.__doc__ or study).splitlines()[0]}\n\n"
+        f"{(config.__doc__ or program).splitlines()[0]}\n\n"
         "Attributes:\n"
-        "    config: Parameters of the study.\n"
-        "    out: Directory for summary.json, arrays.npz and the figures.\n"
-        "    json: Print the summaries as JSON instead of tables.\n"
+        "    config: Parameters.\n"
+        f"    out: Directory for {files}.\n"
+        "    json: Print the summary as JSON instead of tables.\n"
     )
-    program = f"jaxnav run {study}"
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
@@ -60,7 +74,7 @@ def parse_run(study: str, config: type, arguments: list[str]) -> RunOptions | No
             print(said.getvalue(), end="")
             return None
         raise ConfigError(_sentence(said.getvalue(), program)) from None
-    return RunOptions(parsed.config, parsed.out, parsed.json)
+    return Options(parsed.config, parsed.out, parsed.json)
 
 
 def _sentence(box: str, program: str) -> str:

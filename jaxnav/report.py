@@ -75,7 +75,12 @@ def print_result(result: StudyResult, directory: Path, figures: list[Path]) -> N
 def print_json(results: list[StudyResult]) -> None:
     """Print the summaries as JSON: an object for one scenario, a list for several."""
     documents = [summary(result) for result in results]
-    print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=2))
+    print_document(documents[0] if len(documents) == 1 else documents)
+
+
+def print_document(document: Any) -> None:
+    """Print a document as JSON."""
+    print(json.dumps(document, indent=2))
 
 
 def _method_table(result: StudyResult) -> Table:
@@ -141,6 +146,43 @@ def _claim_table(claims: list[Claim]) -> Table:
     return table
 
 
+def print_allan(document: dict[str, Any], directory: Path) -> None:
+    """Print the noise coefficients of gyros and accelerometers with their intervals."""
+    console = Console()
+    counts, step = document["counts"], document["step_s"]
+    console.print(
+        f"{document['samples']} samples, {document['samples'] * step:.6g} s at {1 / step:.6g} Hz; "
+        f"{counts['duplicates']} duplicates dropped, {counts['nan_rows']} rows with an entry that "
+        f"is no number, {counts['gaps']} gaps of {counts['missing']} samples",
+        soft_wrap=True,
+    )
+    for sensor, title in (("gyro", "gyros"), ("accel", "accelerometers")):
+        axes = {name: row for name, row in document["axes"].items() if name.startswith(sensor)}
+        console.print(_noise_table(title, axes, document["confidence"]))
+    for note in document["notes"]:
+        console.print(f"[yellow]{escape(note)}", soft_wrap=True)
+    console.print(f"Written to {directory}: summary.json, allan.npz, allan.png", soft_wrap=True)
+
+
+def _noise_table(
+    title: str, axes: dict[str, dict[str, dict[str, Any]]], confidence: float
+) -> Table:
+    table = Table(show_lines=True, title=f"{title}, with {100 * confidence:.4g} % intervals")
+    table.add_column("axis")
+    for name, entry in next(iter(axes.values())).items():
+        table.add_column(escape(f"{name.replace('_', ' ')}\n[{entry['unit']}]"), justify="right")
+    for axis, entries in axes.items():
+        table.add_row(axis[-1], *(_coefficient(entry) for entry in entries.values()))
+    return table
+
+
+def _coefficient(entry: dict[str, Any]) -> str:
+    """Return a coefficient over its interval, or its bound where it may be zero."""
+    if entry["low"] > 0:
+        return f"{entry['value']:.4g}\n{entry['low']:.3g} to {entry['high']:.3g}"
+    return f"below {entry['high']:.3g}" if entry["high"] < float("inf") else "not known"
+
+
 def print_catalogue() -> None:
     """Print the studies, filters, weight rules and data formats."""
     from jaxnav.estimation import catalogue
@@ -162,7 +204,9 @@ def print_catalogue() -> None:
         for name, text in entries.items():
             listing.add_row(name, escape(text))
         console.print(listing)
-    console.print("data formats: RTKLIB .pos (gnss-track --log PATH)")
+    console.print(
+        "data formats: RTKLIB .pos (run gnss-track --log PATH), inertial CSV (allan PATH)"
+    )
 
 
 def print_doctor() -> None:

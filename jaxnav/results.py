@@ -1,4 +1,4 @@
-"""Results on disk: ``summary.json`` (schema 1), ``arrays.npz``, and the view as xarray."""
+"""Results on disk: JSON (schema 1) and arrays, each complete or not there; the view as xarray."""
 
 import json
 import math
@@ -18,7 +18,7 @@ SCHEMA = 1
 
 def summary(result: StudyResult) -> dict[str, Any]:
     """Return the contents of ``summary.json``: numbers that are not finite become ``null``."""
-    return _finite_or_null(
+    return finite_or_null(
         {
             "schema": SCHEMA,
             "study": result.study,
@@ -49,11 +49,12 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def _finite_or_null(value: Any) -> Any:
+def finite_or_null(value: Any) -> Any:
+    """Return a document as plain data, numbers that are not finite replaced by ``None``."""
     if isinstance(value, dict):
-        return {str(key): _finite_or_null(item) for key, item in value.items()}
+        return {str(key): finite_or_null(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite_or_null(item) for item in value]
+        return [finite_or_null(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -86,11 +87,20 @@ def write(result: StudyResult, directory: Path) -> Path:
     Returns:
         The path of ``summary.json``.
     """
-    text = json.dumps(summary(result), indent=2, allow_nan=False)
-    _replace(directory / "arrays.npz", lambda path: _save_arrays(path, result.arrays))
-    return _replace(
-        directory / "summary.json", lambda path: path.write_text(text + "\n", encoding="utf-8")
-    )
+    document = summary(result)
+    write_arrays(result.arrays, directory / "arrays.npz")
+    return write_document(document, directory / "summary.json")
+
+
+def write_document(document: dict[str, Any], path: Path) -> Path:
+    """Write a document as JSON; the file is complete or not there. Return its path."""
+    text = json.dumps(finite_or_null(document), indent=2, allow_nan=False) + "\n"
+    return _replace(path, lambda beside: beside.write_text(text, encoding="utf-8"))
+
+
+def write_arrays(arrays: dict[str, Any], path: Path) -> Path:
+    """Write arrays by name as compressed ``.npz``, complete or not there. Return the path."""
+    return _replace(path, lambda beside: _save_arrays(beside, arrays))
 
 
 def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:

@@ -27,6 +27,7 @@ def run(
     observations: Obs,
     *,
     record: Recorder | None = None,
+    every: int = 1,
     segment: int = 0,
 ) -> Trace:
     """Run a filter over time: step k predicts over ``[t_{k-1}, t_k]``, then updates at ``t_k``.
@@ -39,6 +40,8 @@ def run(
             valid in the steps between.
         record: ``(state, info) -> pytree`` of what to keep per step; the default keeps
             ``(filter.estimate(state), info)``.
+        every: Keep the record of every so many steps only, from the first such on; ``T`` must be a
+            multiple.
         segment: Length of the segments whose inside is computed again by the backward pass, so that
             a gradient holds ``T / segment + segment`` states instead of ``T``; 0 keeps all. About
             ``sqrt(T)`` is best.
@@ -47,7 +50,8 @@ def run(
         The trace.
 
     Raises:
-        ValueError: If the leading axes of inputs and observations differ.
+        ValueError: If the leading axes of inputs and observations differ, or are no multiple of
+            ``every``.
     """
     steps = {leaf.shape[0] for leaf in jax.tree.leaves((inputs, observations))}
     if len(steps) != 1:
@@ -55,25 +59,38 @@ def run(
             f"inputs and observations have {sorted(steps)} steps; "
             "every leaf needs the same leading time axis"
         )
-    return _run(filter, record, segment, params, inputs, observations)
+    if every < 1 or min(steps) % every:
+        raise ValueError(f"every is {every}; {min(steps)} steps must be a multiple of it")
+    return _run(filter, record, every, segment, params, inputs, observations)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _run(
     filter: Filter,
     record: Recorder | None,
+    every: int,
     segment: int,
     params: Params,
     inputs: Input,
     observations: Obs,
 ) -> Trace:
-    def step(state: Any, now: tuple[Input, Obs]) -> tuple[Any, Any]:
+    def advance(state: Any, now: tuple[Input, Obs]) -> tuple[Any, Any]:
         u, obs = now
-        state, info = filter.update(params, filter.predict(params, state, u), u, obs)
+        return filter.update(params, filter.predict(params, state, u), u, obs)
+
+    def step(state: Any, now: tuple[Input, Obs]) -> tuple[Any, Any]:
+        if every > 1:
+            before = jax.tree.map(lambda leaf: leaf[:-1], now)
+            state, _ = jax.lax.scan(lambda at, one: (advance(at, one)[0], None), state, before)
+            now = jax.tree.map(lambda leaf: leaf[-1], now)
+        state, info = advance(state, now)
         kept = (filter.estimate(state), info) if record is None else record(state, info)
         return state, kept
 
-    final, kept = scan_in_segments(step, filter.init(params), (inputs, observations), segment)
+    over = (inputs, observations)
+    if every > 1:
+        over = jax.tree.map(lambda leaf: leaf.reshape(-1, every, *leaf.shape[1:]), over)
+    final, kept = scan_in_segments(step, filter.init(params), over, segment)
     return Trace(kept, final)
 
 

@@ -26,14 +26,15 @@ from jaxnav.navigation.earth import (
     displaced,
     earth_rate,
     metres_per_radian,
+    normal_gravity,
     offset_between,
     transport_rate,
 )
 from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
-from jaxnav.navigation.strapdown.local_level import level_step, pull
-from jaxnav.numerics.lie import so3_exp, so3_left_jacobian
+from jaxnav.navigation.strapdown.local_level import level_step
+from jaxnav.numerics.lie import skew, so3_exp, so3_left_jacobian
 from jaxnav.numerics.linalg import matmul
 
 CHANNELS = ("vel_e", "vel_n", "vel_u", "pos_e", "pos_n", "pos_u")
@@ -99,8 +100,9 @@ def sins_gnss(
 
     Returns:
         A model with :class:`SinsGnssParams` and :class:`SinsGnssInput`, six channels
-        (:data:`CHANNELS`) and analytic Jacobians, in which terms of a relative size of
-        ``(w_ie + w_en) T`` next to others in the same block are left out.
+        (:data:`CHANNELS`) and analytic Jacobians, in which terms that ``(w_ie + w_en) T`` makes
+        small next to others of the same block are left out, and so is how Earth rate and transport
+        rate change with position.
 
     Raises:
         ValueError: If the error is not a known one, or the right-invariant one has no origin.
@@ -193,38 +195,80 @@ def _process_noise(
     return _length(u) * columns(columns(jnp.block(rows)).T)
 
 
+class _Slopes(NamedTuple):
+    """Blocks of the transition's derivative by additive errors, each ``(3, 3)`` unless said.
+
+    Attributes:
+        back: Turns attitude errors with the frame.
+        felt: Specific velocity gained ``(3,) [m/s]``, whose cross product turns into velocity.
+        by_bias: Of the gain by the accelerometer bias.
+        by_drift: Of the gain by the gyro drift, which turns the axes that it was summed in.
+        turned_by_drift: Of the attitude error by the gyro drift.
+        frame: Of the rotation of the frame by velocity.
+        pull: Of gravity, Coriolis and transport acceleration by velocity.
+        gradient: Of gravity by height, ``()``.
+        stretch: Metres per unit of position after the step over those before, ``(3,)``.
+    """
+
+    back: Array
+    felt: Array
+    by_bias: Array
+    by_drift: Array
+    turned_by_drift: Array
+    frame: Array
+    pull: Array
+    gradient: Array
+    stretch: Array
+
+
+def _slopes(x: SinsLevel, ahead: SinsLevel, u: SinsGnssInput, earth: Earth) -> _Slopes:
+    dt = _length(u)
+    turn, gain = _corrected(x, u)
+    p = displaced(x.position, 0.5 * dt * x.velocity, earth)
+    v = 0.5 * (x.velocity + ahead.velocity)
+    rates = earth_rate(p[0], earth), transport_rate(p, v, earth)
+    one = jnp.eye(3, dtype=v.dtype)
+    # Transport rate is linear in velocity, and so are its columns.
+    frame = jax.vmap(lambda e: transport_rate(p, e, earth), out_axes=1)(one)
+    coriolis = skew(2 * rates[0] + rates[1]) - matmul(skew(v), frame)
+    _, slope = jax.jvp(lambda h: normal_gravity(p[0], h, earth), (p[2],), (jnp.ones_like(p[2]),))
+    back = so3_exp(-dt * (rates[0] + rates[1]))
+    swap = jnp.array([1, 0, 2])
+    metres = [metres_per_radian(at, earth) for at in (x.position, ahead.position)]
+    found = _Slopes(
+        back=back,
+        felt=matmul(x.dcm, gain),
+        by_bias=-dt * x.dcm,
+        by_drift=0.5 * dt * matmul(x.dcm, skew(jnp.where(u.dt > 0, u.gain, 0))),
+        turned_by_drift=-dt * matmul(back, matmul(x.dcm, so3_left_jacobian(turn))),
+        frame=dt * frame,
+        pull=-dt * coriolis,
+        gradient=-dt * slope,
+        stretch=(metres[1] / metres[0])[swap],
+    )
+    # Without the barrier XLA computes the blocks anew for every column of the covariance.
+    return jax.lax.optimization_barrier(found)
+
+
 def _transition_differential(
     x: SinsLevel, ahead: SinsLevel, u: SinsGnssInput, earth: Earth
 ) -> Callable[[Array], Array]:
     """Return the derivative of the transition in additive errors as a function of ``(15,)``."""
     s, dt = LAYOUT, _length(u)
-    turn, gain = _corrected(x, u)
-    raw = jnp.where(u.dt > 0, u.gain, 0)
-    felt = matmul(x.dcm, gain)
-    turning = matmul(x.dcm, so3_left_jacobian(turn))
-    middle_p = displaced(x.position, 0.5 * dt * x.velocity, earth)
-    middle_v = 0.5 * (x.velocity + ahead.velocity)
-
-    def frame(offset: Array, velocity: Array) -> tuple[Array, Array]:
-        place = displaced(middle_p, offset, earth)
-        rate = earth_rate(place[0], earth) + transport_rate(place, velocity, earth)
-        return dt * rate, dt * pull(place, velocity, earth)
-
-    (turned, _), slope = jax.linearize(frame, jnp.zeros_like(middle_v), middle_v)
-    back = so3_exp(-turned)
-    north_east_up = metres_per_radian(ahead.position, earth) / metres_per_radian(x.position, earth)
-    stretch = north_east_up[jnp.array([1, 0, 2])]
+    by = _slopes(x, ahead, u, earth)
 
     def moved(d: Array) -> Array:
-        sensed = d[s.nabla] + 0.5 * jnp.cross(d[s.eps], raw)
-        df = jnp.cross(d[s.phi], felt) - dt * matmul(x.dcm, sensed)
-        dturn, dpull = slope(d[s.dr] + 0.5 * dt * d[s.dv], d[s.dv] + 0.5 * df)
-        gained = df - 0.5 * (jnp.cross(turned, df) + jnp.cross(dturn, felt)) + dpull
+        sensed = matmul(by.by_bias, d[s.nabla]) + matmul(by.by_drift, d[s.eps])
+        df = jnp.cross(d[s.phi], by.felt) + sensed
+        middle = d[s.dv] + 0.5 * df
+        lower = by.gradient * (d[s.dr][2] + 0.5 * dt * d[s.dv][2])
+        gained = df + matmul(by.pull, middle) + jnp.stack([0 * lower, 0 * lower, lower])
+        turned = matmul(by.back, d[s.phi]) + matmul(by.turned_by_drift, d[s.eps])
         return jnp.concatenate(
             [
-                matmul(back, d[s.phi] - dt * matmul(turning, d[s.eps])) - dturn,
+                turned - matmul(by.frame, middle),
                 d[s.dv] + gained,
-                stretch * d[s.dr] + dt * (d[s.dv] + 0.5 * gained),
+                by.stretch * d[s.dr] + dt * (d[s.dv] + 0.5 * gained),
                 d[s.eps],
                 d[s.nabla],
             ]
