@@ -8,6 +8,7 @@ a large batch of them can stall for good (jax 0.10.2 on two cores).
 """
 
 from collections.abc import Callable
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import jax
@@ -42,6 +43,22 @@ def matmul(A: Array, B: Array) -> Array:
         (A[:, j][:, None] * B[j][None] for j in range(1, inner)),
         A[:, 0][:, None] * B[0][None],
     )
+
+
+def materialised(tree: Any) -> Any:
+    """Return small arrays as they are, computed once wherever they are used after.
+
+    XLA on CPUs fuses what is cheap to write into every loop that reads it, and computes it there
+    anew for each element; an optimisation barrier does not stop it, an operand of a ``dot`` does.
+    The product with the identity is exact, at n^2 multiply-adds for n numbers.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    flat = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
+    flat = jnp.eye(flat.shape[0], dtype=flat.dtype) @ flat
+    ends = list(accumulate(leaf.size for leaf in leaves))
+    pieces = [flat[end - leaf.size : end] for leaf, end in zip(leaves, ends, strict=True)]
+    shaped = [piece.reshape(leaf.shape) for piece, leaf in zip(pieces, leaves, strict=True)]
+    return jax.tree.unflatten(structure, shaped)
 
 
 def safe_norm(x: Array) -> Array:

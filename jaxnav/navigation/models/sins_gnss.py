@@ -35,7 +35,7 @@ from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.local_level import level_step
 from jaxnav.numerics.lie import skew, so3_exp, so3_left_jacobian
-from jaxnav.numerics.linalg import matmul
+from jaxnav.numerics.linalg import materialised, matmul
 
 CHANNELS = ("vel_e", "vel_n", "vel_u", "pos_e", "pos_n", "pos_u")
 """Channels of the residual, in order; an observation has latitude, longitude, height in the last
@@ -201,7 +201,6 @@ class _Slopes(NamedTuple):
     Attributes:
         back: Turns attitude errors with the frame.
         felt: Specific velocity gained ``(3,) [m/s]``, whose cross product turns into velocity.
-        by_bias: Of the gain by the accelerometer bias.
         by_drift: Of the gain by the gyro drift, which turns the axes that it was summed in.
         turned_by_drift: Of the attitude error by the gyro drift.
         frame: Of the rotation of the frame by velocity.
@@ -212,7 +211,6 @@ class _Slopes(NamedTuple):
 
     back: Array
     felt: Array
-    by_bias: Array
     by_drift: Array
     turned_by_drift: Array
     frame: Array
@@ -235,19 +233,18 @@ def _slopes(x: SinsLevel, ahead: SinsLevel, u: SinsGnssInput, earth: Earth) -> _
     back = so3_exp(-dt * (rates[0] + rates[1]))
     swap = jnp.array([1, 0, 2])
     metres = [metres_per_radian(at, earth) for at in (x.position, ahead.position)]
-    found = _Slopes(
-        back=back,
-        felt=matmul(x.dcm, gain),
-        by_bias=-dt * x.dcm,
-        by_drift=0.5 * dt * matmul(x.dcm, skew(jnp.where(u.dt > 0, u.gain, 0))),
-        turned_by_drift=-dt * matmul(back, matmul(x.dcm, so3_left_jacobian(turn))),
-        frame=dt * frame,
-        pull=-dt * coriolis,
-        gradient=-dt * slope,
-        stretch=(metres[1] / metres[0])[swap],
+    return materialised(
+        _Slopes(
+            back=back,
+            felt=matmul(x.dcm, gain),
+            by_drift=0.5 * dt * matmul(x.dcm, skew(jnp.where(u.dt > 0, u.gain, 0))),
+            turned_by_drift=-dt * matmul(back, matmul(x.dcm, so3_left_jacobian(turn))),
+            frame=dt * frame,
+            pull=-dt * coriolis,
+            gradient=-dt * slope,
+            stretch=(metres[1] / metres[0])[swap],
+        )
     )
-    # Without the barrier XLA computes the blocks anew for every column of the covariance.
-    return jax.lax.optimization_barrier(found)
 
 
 def _transition_differential(
@@ -256,13 +253,14 @@ def _transition_differential(
     """Return the derivative of the transition in additive errors as a function of ``(15,)``."""
     s, dt = LAYOUT, _length(u)
     by = _slopes(x, ahead, u, earth)
+    vertical = jnp.array([0.0, 0.0, 1.0], x.velocity.dtype)
 
     def moved(d: Array) -> Array:
-        sensed = matmul(by.by_bias, d[s.nabla]) + matmul(by.by_drift, d[s.eps])
+        sensed = matmul(by.by_drift, d[s.eps]) - dt * matmul(x.dcm, d[s.nabla])
         df = jnp.cross(d[s.phi], by.felt) + sensed
         middle = d[s.dv] + 0.5 * df
         lower = by.gradient * (d[s.dr][2] + 0.5 * dt * d[s.dv][2])
-        gained = df + matmul(by.pull, middle) + jnp.stack([0 * lower, 0 * lower, lower])
+        gained = df + matmul(by.pull, middle) + lower * vertical
         turned = matmul(by.back, d[s.phi]) + matmul(by.turned_by_drift, d[s.eps])
         return jnp.concatenate(
             [

@@ -59,9 +59,7 @@ def ratio_map(config: ArekfConfig) -> RatioMap:
     """Return the ratios of errors for each sensor, factor and duration along the true path."""
     inputs, valid = _path(config)
     grades = list(GRADES.values())
-    sets = [
-        (noise_of(grade, config.gnss_position), prior_sigma(config, grade)) for grade in grades
-    ]
+    sets = [(noise_of(grade, config.gnss_position), prior_sigma(config, grade)) for grade in grades]
     truth, sigma = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sets)
     factors = jnp.asarray(config.factors)
     filter = mismatched(sins_gnss(), lambda u: (u.before, u.after))
@@ -109,5 +107,3 @@ def _path(config: ArekfConfig) -> tuple[PathInput, Array]:
     )
     arrived = jnp.arange(1, config.steps + 1) % config.steps_per_fix == 0
     return PathInput(*u, before, after), jnp.broadcast_to(arrived[:, None], (config.steps, 6))
-
-

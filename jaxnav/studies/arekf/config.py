@@ -102,7 +102,7 @@ class ArekfConfig:
     align_s: float = 60.0
     ins_rate_hz: float = 400.0
     gnss_rate_hz: float = 10.0
-    filter_period_s: float = 0.05
+    filter_period_s: float = 0.1
     factors: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
     reported: float = 10.0
     arw_deg_sqrt_h: float | None = None
@@ -114,7 +114,7 @@ class ArekfConfig:
     p0_attitude_deg: tuple[float, float, float] = (0.1, 0.1, 0.5)
     p0_velocity: float = 0.1
     p0_position: float = 3.0
-    heading_deg: float = 30.0
+    heading_deg: float = 60.0
     settle_s: float = 10.0
     outlier_share: float = 0.05
     outlier_scale: float = 10.0
@@ -147,7 +147,7 @@ class ArekfConfig:
         require(
             len(self.p0_attitude_deg) == 3, "p0_attitude_deg", self.p0_attitude_deg, "three numbers"
         )
-        require(self.heading_deg <= 60, "heading_deg", self.heading_deg, "at most 60")
+        require(self.heading_deg <= 90, "heading_deg", self.heading_deg, "at most 90")
         require(
             0 <= self.settle_s < self.duration_s,
             "settle_s",

@@ -40,12 +40,10 @@ class Setup(NamedTuple):
     Attributes:
         timing: Rates and periods.
         scales: Factors on the given noise of the bank's members.
-        settle: Records before the errors count.
     """
 
     timing: Timing
     scales: tuple[float, ...]
-    settle: int
 
 
 class Shared(NamedTuple):
@@ -57,6 +55,7 @@ class Shared(NamedTuple):
         factor: True noise of the inertial sensors over that which was given.
         kernel: Numbers of the Versoria filter.
         adaptation: Numbers of the innovation-based adaptation.
+        settle: Time of flight from which errors count [s].
     """
 
     world: World
@@ -64,6 +63,7 @@ class Shared(NamedTuple):
     factor: Array
     kernel: Versoria
     adaptation: Adaptation
+    settle: Array
 
 
 class Row(NamedTuple):
@@ -94,9 +94,7 @@ THRESHOLDS = (0.5 * np.pi / 180, 0.1, 2.0)
 
 def setup_of(config: ArekfConfig) -> Setup:
     """Return the static part of a configuration."""
-    late = config.scenario == "large-heading-error"
-    settle = round(config.settle_s / (config.steps_per_record * config.filter_period_s))
-    return Setup(timing_of(config), config.factors, settle if late else 0)
+    return Setup(timing_of(config), config.factors)
 
 
 def shared_of(config: ArekfConfig, world: World, factor: float) -> Shared:
@@ -106,7 +104,9 @@ def shared_of(config: ArekfConfig, world: World, factor: float) -> Shared:
     )
     kernel = Versoria(jnp.array(config.versoria_width), jnp.array(config.versoria_power))
     adaptation = Adaptation(jnp.array(config.iae_memory), jnp.array(1e-2), jnp.array(1e4))
-    return Shared(world, given, jnp.array(factor), kernel, adaptation)
+    late = config.scenario == "large-heading-error"
+    settle = jnp.array(config.settle_s if late else 0.0)
+    return Shared(world, given, jnp.array(factor), kernel, adaptation, settle)
 
 
 @cache
@@ -173,9 +173,9 @@ def run_one(setup: Setup) -> Any:
 
     def run_methods(key: Array, shared: Shared) -> RunOutput:
         flight = fly_run(key, shared.world, setup.timing)
-        judged = {}
+        estimates: dict[str, Gaussian] = {}
         for name, filter in filters().items():
-            estimates = run(
+            found = run(
                 filter,
                 params_of(name, flight, shared, setup.scales),
                 flight.inputs,
@@ -183,17 +183,32 @@ def run_one(setup: Setup) -> Any:
                 record=partial(record_estimate, filter),
                 every=setup.timing.steps_per_record,
             ).record
-            for method in SHARED if name == "panel" else (name,):
-                own = estimates[method] if name == "panel" else estimates
-                judged[method] = judge(form_of(method), flight, own, shared, setup)
-        return stacked([judged[name] for name in METHODS])
+            estimates |= found if name == "panel" else {name: found}
+        return judge_all(flight, {name: estimates[name] for name in METHODS}, shared, setup)
 
     return run_methods
 
 
-def stacked(judged: Sequence[RunOutput]) -> RunOutput:
-    """Return the outputs of several methods as one, their axis first in rows, second in time."""
-    row, curve, trace = jax.tree.map(lambda *leaves: jnp.stack(leaves), *judged)
+def judge_all(
+    flight: Run, estimates: dict[str, Gaussian], shared: Shared, setup: Setup
+) -> RunOutput:
+    """Judge methods by name; their axis comes first in rows, second in histories.
+
+    Methods of one definition of the error are judged side by side, which compiles once.
+    """
+    names = list(estimates)
+    kinds = [FORMS.get(name, "additive") for name in names]
+    order, pieces = [], []
+    for kind in dict.fromkeys(kinds):
+        alike = [name for name, own in zip(names, kinds, strict=True) if own == kind]
+        together = jax.tree.map(
+            lambda *leaves: jnp.stack(leaves), *(estimates[name] for name in alike)
+        )
+        one = partial(judge, form_of(alike[0]), flight, shared=shared, setup=setup)
+        pieces.append(jax.vmap(one)(together))
+        order += alike
+    place = jnp.array([order.index(name) for name in names])
+    row, curve, trace = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place], *pieces)
     late = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), (curve, trace))
     return RunOutput(row, *late)
 
@@ -207,7 +222,10 @@ def record_estimate(filter: Filter, state: Any, info: Any) -> Any:
 def judge(
     form: ErrorForm, flight: Run, estimates: Gaussian, shared: Shared, setup: Setup
 ) -> RunOutput:
-    """Compare estimates with true states: errors as additive ones, NEES in the filter's own."""
+    """Compare a method's estimates with true states.
+
+    Errors are additive ones, the NEES is that of the filter's own.
+    """
     truth, count = flight.truth, estimates.cov.shape[0]
     error = jax.vmap(error_form("additive", ORIGIN).local)(truth, estimates.mean)
     blocks = error[:, : LAYOUT.eps.start].reshape(count, 3, 3)
@@ -217,15 +235,16 @@ def judge(
     consistency = jax.vmap(nees)(own, estimates.cov)
     squares = blocks**2
     norms = jnp.sum(squares, axis=2)
-    counted = slice(setup.settle, None)
     period = setup.timing.steps_per_record * setup.timing.samples_per_step * setup.timing.imu_step
+    counted = period * jnp.arange(1, count + 1) > shared.settle
+    share = counted.astype(norms.dtype)[:, None, None] / jnp.sum(counted).astype(norms.dtype)
     below = norms < jnp.array(THRESHOLDS)[None] ** 2
     never = ~jnp.any(below, axis=0)
     true = shared.world.noise
     known = jnp.stack(flight.identified) / jnp.stack([true.gyro_noise, true.accel_noise])
     row = Row(
-        mean_square=jnp.mean(squares[counted], axis=0),
-        stabilisation=jnp.mean((squares / variances)[counted], axis=(0, 2)),
+        mean_square=jnp.sum(share * squares, axis=0),
+        stabilisation=jnp.mean(jnp.sum(share * squares / variances, axis=0), axis=1),
         convergence=period * jnp.where(never, count, 1 + jnp.argmax(below, axis=0)),
         final_nees=consistency[-1],
         final_square=norms[-1],

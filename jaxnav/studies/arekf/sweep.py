@@ -18,12 +18,10 @@ from jaxnav.studies.arekf.config import ArekfConfig
 from jaxnav.studies.arekf.methods import (
     Setup,
     Shared,
-    form_of,
-    judge,
+    judge_all,
     record_estimate,
     setup_of,
     shared_of,
-    stacked,
 )
 from jaxnav.studies.arekf.simulation import Run, build_world, fly_run
 
@@ -57,8 +55,7 @@ def _run_one(setup: Setup, factors: tuple[float, ...]) -> Any:
             record=partial(record_estimate, filter),
             every=setup.timing.steps_per_record,
         ).record
-        form = form_of("ekf")
-        return stacked([judge(form, flight, estimates[name], shared, setup) for name in names])
+        return judge_all(flight, estimates, shared, setup)
 
     return run_filters
 
