@@ -36,6 +36,11 @@ COLOURS = {
     "iterated-ckf": "tab:blue",
     "modified-iterated-ckf": "tab:green",
     "angle-ckf": "tab:orange",
+    "liekf": "tab:olive",
+    "se23-ekf": "tab:cyan",
+    "versoria-ekf": "tab:purple",
+    "iae": "tab:brown",
+    "arekf": "tab:blue",
     "oracle": "black",
 }
 """Colour of each method, the same in all figures."""
@@ -48,6 +53,11 @@ def figure(path: Path, size: tuple[float, float], **layout: Any) -> Iterator[Fig
         made = Figure(figsize=size, layout="constrained", **layout)
         yield made
         made.savefig(path, dpi=DPI)
+
+
+def shades(count: int) -> list[Any]:
+    """Return colours from dark to light for so many steps of one quantity."""
+    return [mpl.colormaps["viridis"](x) for x in np.linspace(0, 0.9, count)]
 
 
 def largest(values: np.ndarray) -> float:

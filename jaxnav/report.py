@@ -84,7 +84,7 @@ def print_document(document: Any) -> None:
 
 
 def _method_table(result: StudyResult) -> Table:
-    """One row a method; a column for each measure that any method has."""
+    """One row a method; a column for each measure that any has, components of another left out."""
     table = Table(
         title=f"{result.study}, {result.scenario}: {result.runs} runs, seed {result.seed}"
     )
@@ -92,7 +92,8 @@ def _method_table(result: StudyResult) -> Table:
     columns: dict[str, str] = {}
     for measures in result.methods.values():
         for name, measure in measures.get("rmse", {}).items():
-            columns[name] = measure["unit"]
+            if "of" not in measure:
+                columns[name] = measure["unit"]
     scalars = list(
         dict.fromkeys(
             name

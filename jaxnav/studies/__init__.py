@@ -58,6 +58,14 @@ STUDIES = {
         scenarios="jaxnav.studies.rkcns.config:SCENARIOS",
         check="jaxnav.studies.rkcns.study:check",
     ),
+    "arekf": Study(
+        summary="MEMS-SINS/GNSS, noise identified before launch, and its rivals (Yang et al.)",
+        config="jaxnav.studies.arekf.config:ArekfConfig",
+        entry="jaxnav.studies.arekf.study:run_study",
+        figures="jaxnav.studies.arekf.figures:draw",
+        scenarios="jaxnav.studies.arekf.config:SCENARIOS",
+        check="jaxnav.studies.base:check_simulated",
+    ),
     "gnss-track": Study(
         summary="a recorded GNSS track through the same bank, judged by predictive likelihood",
         config="jaxnav.studies.gnss_track.config:GnssTrackConfig",
