@@ -16,7 +16,8 @@ Conventions, the same everywhere:
 * **Time**: ``init`` gives the state at t0; step k predicts over [t_{k-1}, t_k], then updates with
   the observation at t_k. Host time is integer nanoseconds, device time is a step length ``dt`` [s].
 * **Noise** of inertial sensors is given per sample; over a filter period T of samples of length
-  T_imu it adds up to ``G Q0 G' T T_imu``.
+  T_imu it adds up to ``G Q0 G' T T_imu``. SINS/GNSS takes the random walks of a data sheet instead
+  (``N`` in rad/sqrt(s) and m/s/sqrt(s)), which add up to ``N^2 T``.
 * **Keys** come first. Run i of a Monte Carlo study has the key ``fold_in(key, i)``.
 * **Precision** follows the arrays. The library never touches ``jax.config``; the command line and
   the studies need 64-bit floats.
@@ -77,6 +78,9 @@ if TYPE_CHECKING:
         linearised_at_truth as linearised_at_truth,
     )
     from jaxnav.estimation.bounds import oracle as oracle
+    from jaxnav.estimation.filters.adaptive import (
+        innovation_adaptive as innovation_adaptive,
+    )
     from jaxnav.estimation.filters.iterated import (
         iterated_ckf as iterated_ckf,
     )
@@ -88,6 +92,8 @@ if TYPE_CHECKING:
     )
     from jaxnav.estimation.filters.kalman import ekf as ekf
     from jaxnav.estimation.filters.kalman import kf as kf
+    from jaxnav.estimation.filters.robust import correntropy as correntropy
+    from jaxnav.estimation.filters.robust import versoria as versoria
     from jaxnav.estimation.filters.sigma_point import ckf as ckf
     from jaxnav.estimation.filters.sigma_point import square_root_ckf as square_root_ckf
     from jaxnav.estimation.filters.sigma_point import square_root_ukf as square_root_ukf
@@ -152,12 +158,14 @@ _HOMES = {
         "windowed_reset",
     ),
     "jaxnav.estimation.bounds": ("linearised_at_truth", "oracle"),
+    "jaxnav.estimation.filters.adaptive": ("innovation_adaptive",),
     "jaxnav.estimation.filters.iterated": (
         "iterated_ckf",
         "iterated_ekf",
         "modified_iterated_ckf",
     ),
     "jaxnav.estimation.filters.kalman": ("ekf", "kf"),
+    "jaxnav.estimation.filters.robust": ("correntropy", "versoria"),
     "jaxnav.estimation.filters.sigma_point": (
         "ckf",
         "square_root_ckf",

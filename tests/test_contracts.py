@@ -20,12 +20,14 @@ from jaxnav.estimation.banks.weights import (
     markov,
 )
 from jaxnav.estimation.bounds import oracle
+from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
 from jaxnav.estimation.filters.iterated import (
     iterated_ckf,
     iterated_ekf,
     modified_iterated_ckf,
 )
 from jaxnav.estimation.filters.kalman import ekf, kf
+from jaxnav.estimation.filters.robust import Correntropy, Versoria, correntropy, versoria
 from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
 from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
 from jaxnav.estimation.run import Trace, run
@@ -89,6 +91,18 @@ def single(theta: float = 1.0) -> FilterParams:
     return FilterParams(Noise(jnp.array(theta), jnp.array(1.0)), prior)
 
 
+def plain(name: str) -> FilterParams:
+    """Parameters of one filter that leave its noise and its data as they are."""
+    settings: dict[str, dict[str, Any]] = {
+        "versoria": {"kernel": Versoria(jnp.array(0.0), jnp.array(2.0))},
+        "correntropy": {"kernel": Correntropy(jnp.array(jnp.inf))},
+        "innovation_adaptive": {
+            "adaptation": Adaptation(jnp.array(5.0), jnp.array(1.0), jnp.array(1.0))
+        },
+    }
+    return single()._replace(**settings.get(name, {}))
+
+
 def members(*theta: float) -> FilterParams:
     """Members of a bank that differ in the process noise."""
     base = replicate(single(), len(theta))
@@ -118,6 +132,9 @@ def _cases() -> dict[str, Case]:
         "iterated_ekf": iterated_ekf(dense_model()),
         "iterated_ckf": iterated_ckf(dense_model()),
         "modified_iterated_ckf": modified_iterated_ckf(dense_model()),
+        "versoria": versoria(ekf, dense_model()),
+        "correntropy": correntropy(ekf, dense_model(), iterations=1),
+        "innovation_adaptive": innovation_adaptive(ekf, dense_model()),
     }
     reset = WindowedReset(jnp.array(5.0), jnp.array(0.9), jnp.array(0.05))
     banks: dict[str, tuple[Filter, Any]] = {
@@ -133,7 +150,7 @@ def _cases() -> dict[str, Case]:
         "immae of ckf": (immae(singles["ckf"]), ((), reset)),
         "mmae of iterated_ckf": (mmae(singles["iterated_ckf"]), ()),
     }
-    cases = {name: Case(made, single(), single()) for name, made in singles.items()}
+    cases = {name: Case(made, plain(name), plain(name)) for name, made in singles.items()}
     for name, (made, rule) in banks.items():
         cases[name] = Case(
             made, BankParams(members(*THETA), rule), BankParams(members(1.0, 1.0, 1.0), rule)
@@ -358,8 +375,8 @@ def test_second_call_does_not_trace_again(name: str) -> None:
 
 BOTH_MODES = ("kf", "square_root_kf")
 """Forward mode is what reverse mode transposes: twice is enough for what it costs to compile."""
-COSTLY = ("immae of ckf", "mmae of iterated_ckf")
-"""Members and a rule whose gradients are tested, but not together."""
+COSTLY = ("immae of ckf", "mmae of iterated_ckf", "versoria", "correntropy", "innovation_adaptive")
+"""Members and a rule whose gradients are tested, but not together; the last in test_robust.py."""
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in COSTLY])
@@ -427,6 +444,29 @@ def test_run_refuses_lengths_that_differ() -> None:
         run(case.filter, case.params, PROBLEM.inputs, Obs(PROBLEM.z[0, 1:], PROBLEM.valid[1:]))
 
 
+def test_every_kth_record_is_that_of_the_whole_run() -> None:
+    """With segments too, which are then of records."""
+    case = CASES["kf"]
+    observations = Obs(PROBLEM.z[0], PROBLEM.valid)
+
+    def recorded(every: int, segment: int) -> Trace:
+        return run(
+            case.filter, case.params, PROBLEM.inputs, observations, every=every, segment=segment
+        )
+
+    whole = recorded(1, 0)
+    for every, segment in ((3, 0), (4, 2)):
+        part = recorded(every, segment)
+        kept = jax.tree.map(lambda leaf, k=every: leaf[k - 1 :: k], whole.record)
+        for a, b in zip(jax.tree.leaves(part.record), jax.tree.leaves(kept), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
+        for a, b in zip(jax.tree.leaves(part.final), jax.tree.leaves(whole.final), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
+    for every in (0, -1, 5, 24):
+        with pytest.raises(ValueError, match=rf"every is {every}; 12 steps must be a multiple"):
+            recorded(every, 0)
+
+
 def _misfits() -> dict[str, tuple[Model, FilterParams, Obs, str]]:
     """Models, parameters and data that do not fit together, and what is said about them."""
     model, params, obs = dense_model(), single(), Obs(PROBLEM.z[0], PROBLEM.valid)
@@ -481,3 +521,14 @@ def test_shapes_that_do_not_fit_are_named(build: Callable[[Model], Filter], wron
     model, params, obs, message = MISFITS[wrong]
     with pytest.raises(ValueError, match=message):
         run(build(model), params, PROBLEM.inputs, obs)
+
+
+@pytest.mark.parametrize("build", [versoria, correntropy, innovation_adaptive])
+@pytest.mark.parametrize("wrong", MISFITS)
+def test_filters_that_hand_noise_to_their_model_name_it_too(
+    build: Callable[[Callable[[Model], Filter], Model], Filter], wrong: str
+) -> None:
+    model, params, obs, message = MISFITS[wrong]
+    channels = r"|3 channels" if wrong in ("data", "mask") else ""
+    with pytest.raises(ValueError, match=message + channels):
+        run(build(ekf, model), params, PROBLEM.inputs, obs)

@@ -105,3 +105,74 @@ def test_gravity_gradient_is_the_derivative_and_has_no_trace():
     np.testing.assert_allclose(np.trace(F, axis1=1, axis2=2), 0, rtol=0, atol=1e-14 * scale)
     at_launch = sins.GM / RADIUS**3 * np.diag([-1.0, 2.0, -1.0])
     np.testing.assert_allclose(F[-1], at_launch, rtol=1e-14)
+
+
+def test_normal_gravity_of_the_ellipsoid_and_above_it():
+    g = jax.jit(jax.vmap(earth.normal_gravity))
+    at_sea = g(np.array([0.0, 0.5, -0.5]) * np.pi, np.zeros(3))
+    np.testing.assert_allclose(at_sea, [9.7803253359, 9.8321849378, 9.8321849378], rtol=1e-11)
+    latitude = np.array([0.0, 45.0, 90.0]) * DEG
+    slope = np.asarray(g(latitude, np.full(3, 50.0)) - g(latitude, np.full(3, -50.0))) / 100
+    # From the equator to the pole, with the free-air gradient of geodesy in the middle.
+    np.testing.assert_allclose(slope, [-3.0877e-6, -3.0855e-6, -3.0834e-6], rtol=0, atol=2e-10)
+    # At 200 km what GM / r^2 less the centrifugal part says, but for the oblateness: 3/2 J2.
+    r = A + 2e5
+    exact = earth.GM / r**2 - earth.WGS84.rate**2 * r
+    np.testing.assert_allclose(g(np.zeros(1), np.full(1, 2e5)), exact, rtol=2e-3)
+
+
+def test_frame_rates_are_those_of_its_turning_axes():
+    places, velocity = PLACES[[0, 1, 5, 6]], np.array([250.0, -120.0, 30.0])
+
+    @jax.jit
+    @jax.vmap
+    def rates(p):
+        metres = earth.metres_per_radian(p)
+        ecef_slope = jax.jacfwd(earth.ecef_from_geodetic)(p)
+        moved = velocity[np.array([1, 0, 2])] / metres
+
+        def axes(t):
+            return earth.dcm_ne(p[0] + t * moved[0], p[1] + t * moved[1])
+
+        C, slope = jax.jvp(axes, (0.0,), (1.0,))
+        turned = earth.transport_rate(p, jnp.asarray(velocity)), earth.earth_rate(p[0])
+        return metres, jnp.linalg.norm(ecef_slope, axis=0), *turned, C, slope
+
+    metres, stretch, transport, rate, C, slope = map(np.asarray, rates(places))
+    np.testing.assert_allclose(metres, stretch, rtol=1e-14)
+    # The axes are rows: dC/dt = -[w]x C with the rate w in the axes themselves.
+    W = -slope @ C.transpose(0, 2, 1)
+    automatic = np.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]], axis=1)
+    np.testing.assert_allclose(transport, automatic, rtol=1e-12, atol=1e-19)
+    north = C @ [0.0, 0.0, earth.WGS84.rate]
+    np.testing.assert_allclose(rate, north, rtol=1e-15, atol=1e-20)
+
+
+def test_offsets_and_displacements_undo_each_other_across_the_antimeridian():
+    """Longitudes to either side of it are near: row 23 of the hard inputs."""
+    places = PLACES[[0, 1, 2, 5, 6]]
+    offset = np.random.default_rng(2).uniform(-5e3, 5e3, (5, 3))
+    offset[3:, 0] = [4e3, -4e3]
+    moved = jax.jit(jax.vmap(earth.displaced))(places, offset)
+    back = jax.jit(jax.vmap(earth.offset_between))
+    np.testing.assert_allclose(back(places, moved), offset, rtol=0, atol=3e-9)
+    wrapped = np.array(moved)
+    wrapped[3:, 1] -= np.sign(wrapped[3:, 1]) * 2 * np.pi
+    assert np.all(np.abs(wrapped[3:, 1]) < np.pi)
+    np.testing.assert_allclose(back(places, wrapped), offset, rtol=0, atol=6e-9)
+    # Exact but for the curvature: d^2 / (2 R), with the tangent of the latitude across.
+    near = jax.jit(jax.vmap(earth.displaced))(places, 0.1 * offset)
+    np.testing.assert_allclose(enu(near, places), 0.1 * offset, rtol=0, atol=0.1)
+
+
+def test_flat_earth_neither_turns_nor_curves():
+    position, velocity = jnp.array([1e-12, 1e-12, 500.0]), jnp.array([300.0, -200.0, 50.0])
+    flat = earth.FLAT
+    np.testing.assert_array_equal(earth.earth_rate(position[0], flat), 0)
+    assert np.abs(earth.transport_rate(position, velocity, flat)).max() < 1e-14
+    np.testing.assert_allclose(
+        earth.normal_gravity(position[0], position[2], flat), flat.gravity, rtol=1e-14
+    )
+    np.testing.assert_allclose(
+        earth.metres_per_radian(position, flat), [flat.semi_major, flat.semi_major, 1], rtol=1e-14
+    )

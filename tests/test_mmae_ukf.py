@@ -1,5 +1,6 @@
 """The study mmae-ukf: the figures it must reach at full length, consistency, and bad input."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -171,7 +172,7 @@ def test_plain_bank_remembers_and_the_others_forget(paper: Campaign) -> None:
 
 @pytest.mark.slow
 def test_reversed_schedule() -> None:
-    judge_fading_and_oracle(run_campaign(MmaeUkfConfig(scenario="reversed", runs=20)))
+    judge_fading_and_oracle(run_campaign(replace(PAPER, scenario="reversed")))
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,7 @@ def test_ten_thousand_runs_of_the_linear_chain_hold_in_memory() -> None:
         jax.config.update("jax_num_cpu_devices", 2)
         from jaxnav.studies.immae.config import ImmaeConfig
         from jaxnav.studies.immae.study import run_campaign
-        campaign = run_campaign(ImmaeConfig(chain="linear", runs=10_000))
+        campaign = run_campaign(ImmaeConfig(chain="linear", runs=10_000, duration_s=100.0))
         assert campaign.finite.all()
         assert campaign.rows.mean_square.shape == (10_000, 6, 3)
         # getrusage would count what the parent held when it started this process

@@ -7,7 +7,14 @@ Knows nothing of navigation: a state-space model from any field is a :class:`~.t
 def catalogue() -> dict[str, dict[str, str]]:
     """Return the filters, banks and weight rules with the first line of their documentation."""
     from jaxnav.estimation.banks import imm, mixture, weights
-    from jaxnav.estimation.filters import iterated, kalman, sigma_point, square_root
+    from jaxnav.estimation.filters import (
+        adaptive,
+        iterated,
+        kalman,
+        robust,
+        sigma_point,
+        square_root,
+    )
 
     groups = {
         "filters": (
@@ -22,6 +29,9 @@ def catalogue() -> dict[str, dict[str, str]]:
             iterated.iterated_ekf,
             iterated.iterated_ckf,
             iterated.modified_iterated_ckf,
+            robust.versoria,
+            robust.correntropy,
+            adaptive.innovation_adaptive,
         ),
         "banks": (mixture.bank, mixture.mmae, mixture.immae, imm.imm, mixture.panel),
         "weight rules": tuple(weights.RULES.values()),

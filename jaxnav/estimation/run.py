@@ -80,10 +80,10 @@ def _run(
 
     def step(state: Any, now: tuple[Input, Obs]) -> tuple[Any, Any]:
         if every > 1:
-            before = jax.tree.map(lambda leaf: leaf[:-1], now)
-            state, _ = jax.lax.scan(lambda at, one: (advance(at, one)[0], None), state, before)
-            now = jax.tree.map(lambda leaf: leaf[-1], now)
-        state, info = advance(state, now)
+            state, infos = jax.lax.scan(advance, state, now)
+            info = jax.tree.map(lambda leaf: leaf[-1], infos)
+        else:
+            state, info = advance(state, now)
         kept = (filter.estimate(state), info) if record is None else record(state, info)
         return state, kept
 

@@ -1,16 +1,19 @@
 """What a step of a method costs on its own, where a paper names the price of its method."""
 
+import gc
 import time
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax import Array
+from jax.flatten_util import ravel_pytree
 
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, Obs
 
 CALLS = 3000
+WARM_UP = 300
 RUNS = 16
 STEPS = 200
 REPEATS = 3
@@ -26,6 +29,11 @@ class Latency(NamedTuple):
 def step_latency(filter: Filter, params: Any, inputs: Any, observations: Obs) -> Latency:
     """Time single steps of a filter one by one, as a navigation computer would make them.
 
+    The parameters are constants of the compiled step, as they are on board; the state and the data
+    of the step are packed into an array each, since every array that is passed costs a microsecond.
+    The collection of garbage is put off meanwhile. Where JAX hands calls on to another thread
+    (``jax_cpu_enable_async_dispatch``) the way there and back is part of what is measured.
+
     Args:
         filter: The filter or bank.
         params: Its parameters.
@@ -34,18 +42,31 @@ def step_latency(filter: Filter, params: Any, inputs: Any, observations: Obs) ->
         observations: Likewise.
     """
 
-    def step(params: Any, state: Any, u: Any, obs: Obs) -> Any:
-        return filter.update(params, filter.predict(params, state, u), u, obs)[0]
-
     last = jax.tree.map(lambda leaf: leaf[-1], (inputs, observations))
-    state = jax.jit(filter.init)(params)
-    compiled = jax.jit(step).lower(params, state, *last).compile()
-    jax.block_until_ready(compiled(params, state, *last))
-    times = []
-    for _ in range(CALLS):
+    valid = last[1].valid
+    state, unpack_state = ravel_pytree(jax.jit(filter.init)(params))
+    data, unpack_data = ravel_pytree((last[0], last[1].z))
+
+    @jax.jit
+    def step(packed: Array, data: Array, valid: Array) -> Array:
+        u, z = unpack_data(data)
+        predicted = filter.predict(params, unpack_state(packed), u)
+        return ravel_pytree(filter.update(params, predicted, u, Obs(z, valid))[0])[0]
+
+    def once() -> float:
         begin = time.perf_counter()
-        jax.block_until_ready(compiled(params, state, *last))
-        times.append(time.perf_counter() - begin)
+        step(state, data, valid).block_until_ready()
+        return time.perf_counter() - begin
+
+    for _ in range(WARM_UP):
+        once()
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        times = [once() for _ in range(CALLS)]
+    finally:
+        if collecting:
+            gc.enable()
     median, slow = np.percentile(times, [50, 99])
     return Latency(1e6 * float(median), 1e6 * float(slow))
 

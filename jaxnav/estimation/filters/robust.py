@@ -123,7 +123,7 @@ def _reweighted(
             seen = model.observe(params.model, base.estimate(moved).mean, u)
             e = solve_lower(L, masked_innovation(model, obs, seen))
             w = jnp.maximum(weight(kernel, e * e), LEAST_WEIGHT)
-            moved, again = base.update(given(params, 1.0, matmul(L / w, L.T)), state, u, obs)
+            moved, again = base.update(given(params, 1.0, matmul(L / w[None], L.T)), state, u, obs)
             flags = flags | again.flags
         return moved, info._replace(iterations=info.iterations + iterations, flags=flags)
 

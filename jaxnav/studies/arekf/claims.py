@@ -72,7 +72,7 @@ def assess(
             for kind in KINDS
         ]
     else:
-        at = {s: campaigns[s] for s in config.factors if s >= 2}
+        at = {s: campaigns[s] for s in sorted({config.reported, max(config.factors)})}
         claims = [
             *(_twofold(s, own, kind) for s, own in at.items() for kind in KINDS[:2]),
             *(_position_is_similar(s, own) for s, own in at.items()),

@@ -88,7 +88,7 @@ class ArekfConfig:
         r_factors: Factors on the standard deviations that the EKF of "r-sweep" believes.
         versoria_width: Width ``tau`` of the Versoria weights.
         versoria_power: Power ``p`` of the Versoria weights.
-        iae_memory: Updates that the innovation-based adaptation averages over.
+        iae_memory: Memory of the innovation-based adaptation [updates].
         analysis: Whether to draw the map over factor, sensor and duration.
         cost: Whether to time each method on its own.
     """
@@ -121,7 +121,7 @@ class ArekfConfig:
     r_factors: tuple[float, ...] = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
     versoria_width: float = 0.05
     versoria_power: float = 2.0
-    iae_memory: float = 100.0
+    iae_memory: float = 20.0
     analysis: bool = True
     cost: bool = True
 

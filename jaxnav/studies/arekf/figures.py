@@ -88,7 +88,7 @@ def _draw_axes(result: StudyResult, path: Path, kind: str) -> None:
         grid[0, 0].set_title("RMSE over runs")
         grid[0, 1].set_title("error of run 0")
         grid[0, 0].legend(ncols=2, fontsize=8)
-        grid[0, 1].legend(fontsize=8, loc="upper right")
+        grid[0, 1].legend(fontsize=8, loc="lower left")
         for axes in grid[-1]:
             axes.set_xlabel("time of flight [s]")
         drawing.suptitle(f"{kind} error, {_told(result)}")

@@ -55,7 +55,8 @@ def _run_one(setup: Setup, factors: tuple[float, ...]) -> Any:
             record=partial(record_estimate, filter),
             every=setup.timing.steps_per_record,
         ).record
-        return judge_all(flight, estimates, shared, setup)
+        in_order = {name: estimates[name] for name in names}
+        return judge_all(flight, in_order, shared, setup)
 
     return run_filters
 
