@@ -41,7 +41,6 @@ def step_latency(filter: Filter, params: Any, inputs: Any, observations: Obs) ->
             at t0.
         observations: Likewise.
     """
-
     last = jax.tree.map(lambda leaf: leaf[-1], (inputs, observations))
     valid = last[1].valid
     state, unpack_state = ravel_pytree(jax.jit(filter.init)(params))

@@ -7,8 +7,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.filters.given_noise import given, with_given_noise
-from jaxnav.estimation.filters.innovation import mask_noise
+from jaxnav.estimation.filters.innovation import noise_of_channels
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
+
+LARGEST_RATIO = 10.0
+"""Largest ratio of a squared innovation to its variance that counts."""
+
 
 class Adaptation(NamedTuple):
     """Parameters of :func:`innovation_adaptive`.
@@ -34,11 +38,12 @@ class AdaptiveState(NamedTuple):
 def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filter:
     """Return a filter that scales its process noise until its innovations are as large as expected.
 
-        log s = log s + mean(nu^2 / S - 1) / W,   Q = s Q_model,   s in [low, high]
+        log s = log s + mean(min(nu^2 / S, 10) - 1) / W,   Q = s Q_model,   s in [low, high]
 
     with the mean over the channels that arrived: zero on average when the filter is consistent, so
-    that nothing drifts, and a step up the innovations' likelihood otherwise. Without data the
-    factor stays. Parameters are :class:`~jaxnav.estimation.types.FilterParams` with
+    that nothing drifts, and a step up the innovations' likelihood otherwise. The bound keeps one
+    outlier from deciding; a thousandth of good data reach it. Without data the factor stays.
+    Parameters are :class:`~jaxnav.estimation.types.FilterParams` with
     :class:`Adaptation` as ``adaptation``.
 
     One factor for the whole Q is what a few channels can tell; the full matrix ``K C K'`` of
@@ -66,14 +71,16 @@ def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filte
         params: FilterParams, state: AdaptiveState, u: Input, obs: Obs
     ) -> tuple[AdaptiveState, Info]:
         own = Adaptation() if params.adaptation == () else params.adaptation
-        x = base.estimate(state.inner).mean
-        R = mask_noise(model.observation_noise(params.model, x, u), obs.valid)
+        R = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
         inner, info = base.update(given(params, 1.0, R), state.inner, u, obs)
-        excess = info.innovation**2 / jnp.diag(info.innovation_cov) - 1
-        channels = jnp.maximum(jnp.sum(obs.valid), 1).astype(excess.dtype)
-        step = jnp.sum(jnp.where(obs.valid, excess, 0)) / channels / own.memory
+        S = jnp.diag(info.innovation_cov)
+        told = obs.valid & (S > 0)
+        ratio = info.innovation**2 / jnp.where(told, S, 1)
+        excess = jnp.where(told, jnp.minimum(ratio, LARGEST_RATIO) - 1, 0)
+        channels = jnp.maximum(jnp.sum(told), 1).astype(S.dtype)
+        step = jnp.sum(excess) / channels / own.memory
         moved = jnp.clip(state.log_factor + step, jnp.log(own.low), jnp.log(own.high))
-        return AdaptiveState(inner, moved.astype(excess.dtype)), info
+        return AdaptiveState(inner, moved.astype(S.dtype)), info
 
     def estimate(state: AdaptiveState) -> Gaussian:
         return base.estimate(state.inner)

@@ -34,6 +34,16 @@ def require_channels(obs: Obs, observed: tuple[int, ...]) -> None:
         )
 
 
+def noise_of_channels(model: Model, params: Any, x: Any, u: Any, obs: Obs) -> Array:
+    """Return a model's noise covariance ``(m, m)`` at a state, masked as by :func:`mask_noise`.
+
+    Raises:
+        ValueError: If observation, model and noise do not fit together.
+    """
+    require_channels(obs, jax.eval_shape(model.observe, params, x, u).shape)
+    return mask_noise(model.observation_noise(params, x, u), obs.valid)
+
+
 def mask_noise(R: Array, valid: Array) -> Array:
     """Return the noise covariance ``(m, m)`` with the identity in channels that are not valid.
 

@@ -57,7 +57,9 @@ def increments_from_rates(
 ) -> tuple[Array, Array]:
     """Return the integrals of sampled rates over the intervals between samples.
 
-    The trapezoid of the two samples at the ends. A sample that is not valid is stood for by the
+    The trapezoid of the two samples at the ends, whose error is of the size of the coning within an
+    interval: :func:`coning_and_sculling` of it gains nothing, and samples have to be dense beside
+    the motion. A sample that is not valid is stood for by the
     last valid one before it, and its value is never used; a leading one by zero.
 
     Args:
