@@ -1,7 +1,13 @@
 """Strict settings for the whole suite: float64, no silent promotion, two host devices."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import jax
 import pytest
+
+from jaxnav.datasets.base import DataError
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
@@ -13,3 +19,35 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 def key() -> jax.Array:
     """A fixed random key."""
     return jax.random.key(20260101)
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[..., Path]:
+    """Write lines to a file and return its path."""
+
+    def to_file(*lines: str, name: str = "log.txt") -> Path:
+        path = tmp_path / name
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+    return to_file
+
+
+@pytest.fixture
+def refusal_by(write: Callable[..., Path]) -> Callable[..., Callable[..., str]]:
+    """Return, for a reader, what writes a file, has it read and returns the refusal's sentence."""
+
+    def by(load: Callable[[Path], Any]) -> Callable[..., str]:
+        def of(*lines: str) -> str:
+            path = write(*lines)
+            with pytest.raises(DataError) as caught:
+                load(path)
+            message = str(caught.value)
+            assert message.startswith(str(path))
+            assert "accepted" in message
+            assert "\n" not in message
+            return message
+
+        return of
+
+    return by

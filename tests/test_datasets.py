@@ -33,30 +33,8 @@ def epoch(second: float = 18.499, position: str = POSITION) -> str:
 
 
 @pytest.fixture
-def write(tmp_path):
-    def to_file(*lines: str, name: str = "log.pos") -> Path:
-        path = tmp_path / name
-        path.write_text("\n".join(lines) + "\n")
-        return path
-
-    return to_file
-
-
-@pytest.fixture
-def refusal(write):
-    """Writes a file, loads it and returns the one sentence of the refusal."""
-
-    def of(*lines: str) -> str:
-        path = write(*lines)
-        with pytest.raises(DataError) as caught:
-            load_rtklib_pos(path)
-        message = str(caught.value)
-        assert message.startswith(str(path))
-        assert "accepted" in message
-        assert "\n" not in message
-        return message
-
-    return of
+def refusal(refusal_by):
+    return refusal_by(load_rtklib_pos)
 
 
 def track_at(times_s, **fields) -> GnssTrack:
