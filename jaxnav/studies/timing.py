@@ -34,8 +34,9 @@ def step_latency(filter: Filter, params: Any, inputs: Any, observations: Obs) ->
 
     The parameters are constants of the compiled step, as they are on board; the state, which is
     replaced in place, and the data of the step are packed into an array each, since every array
-    that is passed costs a microsecond. The collection of garbage is put off meanwhile. Where JAX hands calls on to another thread
-    (``jax_cpu_enable_async_dispatch``) the way there and back is part of what is measured.
+    that is passed costs a microsecond. The collection of garbage is put off meanwhile. Where JAX
+    hands calls on to another thread (``jax_cpu_enable_async_dispatch``) the way there and back is
+    part of what is measured.
 
     Args:
         filter: The filter or bank.

@@ -236,7 +236,8 @@ def judge(
     squares = blocks**2
     norms = jnp.sum(squares, axis=2)
     period = setup.timing.steps_per_record * setup.timing.samples_per_step * setup.timing.imu_step
-    counted = period * jnp.arange(1, count + 1) > shared.settle
+    time = period * jnp.arange(1, count + 1, dtype=norms.dtype)
+    counted = time > shared.settle
     share = counted.astype(norms.dtype)[:, None, None] / jnp.sum(counted).astype(norms.dtype)
     below = norms < jnp.array(THRESHOLDS)[None] ** 2
     never = ~jnp.any(below, axis=0)
@@ -245,7 +246,7 @@ def judge(
     row = Row(
         mean_square=jnp.sum(share * squares, axis=0),
         stabilisation=jnp.mean(jnp.sum(share * squares / variances, axis=0), axis=1),
-        convergence=period * jnp.where(never, count, 1 + jnp.argmax(below, axis=0)),
+        convergence=jnp.where(never, time[-1], time[jnp.argmax(below, axis=0)]),
         final_nees=consistency[-1],
         final_square=norms[-1],
         identified=known,
