@@ -34,7 +34,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 BAD = {
     "unknown command": (("fly",), ("'fly'", "list, run, allan, doctor")),
-    "unknown study": (("run", "imae"), ("'imae'", "immae, mmae-ukf, rkcns, gnss-track")),
+    "unknown study": (("run", "imae"), ("'imae'", "immae, mmae-ukf, rkcns, arekf, gnss-track")),
     "unknown scenario": (
         ("run", "immae", "--scenario", "calm"),
         ("calm", "matched-noise", "noise-step", "all"),

@@ -251,6 +251,42 @@ def test_a_gap_of_a_second_is_bridged_and_known() -> None:
     assert nis.mean() < 16.8, "the fixes after it fit: chi-square of six, 1 % of one"
 
 
+def test_filters_of_all_definitions_are_one_where_errors_are_small() -> None:
+    """From the same prior, in each one's coordinates, to the same estimate and covariance."""
+    small, plain = 1e-5, error_form("additive", ORIGIN)
+    x = jax.tree.map(lambda leaf: leaf[0], states(1))
+    quiet = jax.tree.map(lambda leaf: small * leaf, PARAMS)._replace(lever_arm=PARAMS.lever_arm)
+    P = jnp.diag((small * jnp.array(SIGMA)) ** 2)
+    off = np.random.default_rng(6).normal(size=6) * np.repeat([0.1, 3 / 6.4e6], 3)
+    off[5] *= 6.4e6
+
+    def posteriors(obs: Obs) -> list[tuple[Array, Array]]:
+        found = []
+        for name in FORMS:
+            form, filter = error_form(name, ORIGIN), ekf(sins_gnss(name, ORIGIN))
+
+            def columns(at: SinsLevel, A: Array, push=form.from_additive) -> Array:
+                return jax.vmap(lambda d: push(at, d), 1, 1)(A)
+
+            own = columns(x, columns(x, P).T)
+            params = FilterParams(quiet, Gaussian(x, own))
+            state = filter.predict(params, filter.init(params), sensed())
+            state, _ = filter.update(params, state, sensed(), obs)
+            back = columns(state.x, columns(state.x, state.P, form.to_additive).T, form.to_additive)
+            found.append((plain.local(x, state.x), back))
+        return found
+
+    ahead = MOVE(x, sensed())
+    z = sins_gnss().observe(PARAMS, ahead, sensed()) + small * jnp.array(off)
+    found = jax.jit(posteriors)(Obs(z, jnp.ones(6, bool)))
+    scale = small * SIGMA
+    for mean, cov in found[1:]:
+        np.testing.assert_allclose(mean / scale, found[0][0] / scale, rtol=1e-9, atol=1e-3)
+        np.testing.assert_allclose(
+            cov / np.outer(scale, scale), found[0][1] / np.outer(scale, scale), atol=1e-3
+        )
+
+
 def test_the_error_must_be_a_known_one() -> None:
     with pytest.raises(ValueError, match="additive, left-invariant, right-invariant"):
         sins_gnss("middle-invariant", ORIGIN)  # pyright: ignore[reportArgumentType]

@@ -32,6 +32,7 @@ from jaxnav.navigation.earth import (
 )
 from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.models.sins_cns import LAYOUT
+from jaxnav.navigation.sensors.gnss import antenna_motion
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.local_level import level_step
 from jaxnav.numerics.lie import skew, so3_exp, so3_left_jacobian
@@ -119,11 +120,10 @@ def sins_gnss(
         return _process_noise(form, params, x, u)
 
     def observe(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
-        arm = matmul(x.dcm, params.lever_arm)
-        swung = matmul(x.dcm, jnp.cross(u.rate - x.drift, params.lever_arm))
-        carried = jnp.cross(earth_rate(x.position[0], earth), arm)
-        antenna = displaced(x.position, arm, earth)
-        return jnp.concatenate([x.velocity + swung - carried, antenna])
+        turning = u.rate - x.drift - matmul(x.dcm.T, earth_rate(x.position[0], earth))
+        arm = params.lever_arm
+        moving = antenna_motion(x.dcm, x.velocity, x.position, turning, arm, earth)
+        return jnp.concatenate(moving)
 
     def observation_noise(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
         del x, u

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.navigation.earth import WGS84, Earth, displaced
+from jaxnav.numerics.linalg import matmul
 
 
 class GnssErrors(NamedTuple):
@@ -66,8 +67,8 @@ def antenna_motion(
         lever_arm: From the inertial sensors to the antenna ``(3,) [m]``, body axes.
         earth: The Earth.
     """
-    swung = dcm @ jnp.cross(rate, lever_arm)
-    return velocity + swung, displaced(position, dcm @ lever_arm, earth)
+    swung = matmul(dcm, jnp.cross(rate, lever_arm))
+    return velocity + swung, displaced(position, matmul(dcm, lever_arm), earth)
 
 
 def outages(time: Array, spans: Sequence[tuple[float, float]]) -> Array:
