@@ -16,3 +16,5 @@ STANDARD_GRAVITY = 9.7803267714
 """Gravity unit of the papers [m/s^2]: normal gravity at the equator (GRS80)."""
 MICRO_G = 1e-6 * STANDARD_GRAVITY
 """Millionth of the gravity unit [m/s^2]."""
+GRAVITY = 9.80665
+"""The g of data sheets and of recorded logs [m/s^2]: standard gravity (CGPM 1901)."""

@@ -7,7 +7,8 @@ import pytest
 
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.inertial import ImuLog, load_imu_csv, on_grid, window
-from jaxnav.datasets.plausible import GRAVITY, check_plausible
+from jaxnav.datasets.plausible import check_plausible
+from jaxnav.units import GRAVITY
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 DRIVE, FLIGHT = DATA / "rtk_drive" / "imu_1934.csv", DATA / "rocket_hedy" / "imu.csv"

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxnav.datasets.base import DataError, read_text
-from jaxnav.datasets.plausible import GRAVITY, check_plausible
-from jaxnav.units import DEG
+from jaxnav.datasets.plausible import check_plausible
+from jaxnav.units import DEG, GRAVITY
 
 SENSORS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 COLUMNS = ("time", *SENSORS)

@@ -4,9 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxnav.datasets.base import DataError
-
-GRAVITY = 9.80665
-"""The g of data sheets [m/s^2], standard gravity of the CGPM of 1901."""
+from jaxnav.units import GRAVITY
 
 _SEVERAL_AXES = 35.0
 _ONE_AXIS = 350.0

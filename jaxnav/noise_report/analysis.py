@@ -12,7 +12,6 @@ from jax import Array
 
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.inertial import SENSORS, ImuLog, load_imu_csv, on_grid, window
-from jaxnav.datasets.plausible import GRAVITY
 from jaxnav.navigation.sensors.allan import (
     AllanVariance,
     allan_variance,
@@ -29,7 +28,7 @@ from jaxnav.navigation.sensors.noise_fit import (
 )
 from jaxnav.noise_report.config import AllanConfig, check
 from jaxnav.results import SCHEMA, provenance
-from jaxnav.units import ARCSEC, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR
+from jaxnav.units import ARCSEC, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, GRAVITY, HOUR
 
 SHORTEST = 72
 """Samples of a record that holds the four cluster sizes the fit needs."""

@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.datasets.plausible import GRAVITY
 from jaxnav.plotting import figure
-from jaxnav.units import DEG_PER_HOUR
+from jaxnav.units import DEG_PER_HOUR, GRAVITY
 
 _PANELS = (("gyro", DEG_PER_HOUR, "deg/h"), ("accel", 1e-6 * GRAVITY, "µg"))
 _COLOURS = {"x": "tab:blue", "y": "tab:orange", "z": "tab:green"}
