@@ -62,7 +62,7 @@ def adapted(
             nu = z[k, valid[k]] - H @ x
             K = P @ H.T @ np.linalg.inv(S)
             x, P = x + K @ nu, P - K @ S @ K.T
-            log_factor += np.mean(np.minimum(nu**2 / np.diag(S), 10) - 1) / memory
+            log_factor += np.mean(np.minimum(nu**2 / np.diag(S), 10) - 0.9970879) / memory
             log_factor = float(np.clip(log_factor, *np.log(bounds)))
         means.append(x)
         factors.append(np.exp(log_factor))

@@ -12,13 +12,16 @@ from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input,
 
 LARGEST_RATIO = 10.0
 """Largest ratio of a squared innovation to its variance that counts."""
+MEAN_RATIO = 0.9970879
+"""Mean of that ratio, bounded so, for a consistent filter: of a chi-square variable of one degree
+of freedom, ``1 - 2 sqrt(b) pdf(sqrt(b)) - (1 - b) erfc(sqrt(b / 2))`` with the normal density."""
 
 
 class Adaptation(NamedTuple):
     """Parameters of :func:`innovation_adaptive`.
 
     Attributes:
-        memory: Updates over which a constant excess moves the factor by ``e``, at least one.
+        memory: Updates over which an excess of one moves the factor by ``e``, at least one.
         low: Smallest factor on the process noise.
         high: Largest factor.
     """
@@ -38,13 +41,13 @@ class AdaptiveState(NamedTuple):
 def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filter:
     """Return a filter that scales its process noise until its innovations are as large as expected.
 
-        log s = log s + mean(min(nu^2 / S, 10) - 1) / W,   Q = s Q_model,   s in [low, high]
+        log s = log s + mean(min(nu^2 / S, 10) - c) / W,   Q = s Q_model,   s in [low, high]
 
-    with the mean over the channels that arrived: zero on average when the filter is consistent, so
-    that nothing drifts, and a step up the innovations' likelihood otherwise. The bound keeps one
-    outlier from deciding; a thousandth of good data reach it. Without data the factor stays.
-    Parameters are :class:`~jaxnav.estimation.types.FilterParams` with
-    :class:`Adaptation` as ``adaptation``.
+    with the mean over the channels that arrived, and ``c`` what the ratio is on average when the
+    filter is consistent, so that nothing drifts then; otherwise it is a step up the innovations'
+    likelihood. The bound keeps one outlier from deciding; a thousandth of good data reach it.
+    Without data the factor stays. Outliers that come often are taken for process noise. Parameters
+    are :class:`~jaxnav.estimation.types.FilterParams` with :class:`Adaptation` as ``adaptation``.
 
     One factor for the whole Q is what a few channels can tell; the full matrix ``K C K'`` of
     Mohamed and Schwarz is of their rank and loses the structure of the model. The ratio of traces
@@ -76,7 +79,7 @@ def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filte
         S = jnp.diag(info.innovation_cov)
         told = obs.valid & (S > 0)
         ratio = info.innovation**2 / jnp.where(told, S, 1)
-        excess = jnp.where(told, jnp.minimum(ratio, LARGEST_RATIO) - 1, 0)
+        excess = jnp.where(told, jnp.minimum(ratio, LARGEST_RATIO) - MEAN_RATIO, 0)
         channels = jnp.maximum(jnp.sum(told), 1).astype(S.dtype)
         step = jnp.sum(excess) / channels / own.memory
         moved = jnp.clip(state.log_factor + step, jnp.log(own.low), jnp.log(own.high))

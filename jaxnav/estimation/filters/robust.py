@@ -63,7 +63,8 @@ def versoria(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
         iterations: Number of reweighted updates.
 
     Raises:
-        ValueError: If there is no iteration.
+        ValueError: If there is no iteration, or the model has ``noisy``, noise that does not just
+            add, which a filter would use in place of the reweighted one.
 
     References:
         Huang, Zhang, Xu, Wu, Chambers (2017) for reweighting by fixed-point iteration; Zhao et al.
@@ -109,6 +110,10 @@ def _reweighted(
     """
     if iterations < 1:
         raise ValueError(f"iterations is {iterations}; a robust update needs at least 1")
+    if model.noisy is not None:
+        raise ValueError(
+            "the model has noise that does not add; a robust filter needs one that does"
+        )
     base = build(with_given_noise(model))
 
     def predict(params: FilterParams, state: Any, u: Input) -> Any:

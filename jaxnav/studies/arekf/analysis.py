@@ -22,12 +22,12 @@ GRADES = {
     "noise-dominated": NOISY,
     "half of its noise": replace(NOISY, arw=1.0, vrw=0.3),
     "with MEMS bias": replace(NOISY, drift=BIASED.drift, bias=BIASED.bias),
-    "half, MEMS bias": replace(BIASED, arw=1.0, vrw=0.3),
+    "half, MEMS bias": replace(NOISY, arw=1.0, vrw=0.3, drift=BIASED.drift, bias=BIASED.bias),
     "bias-dominated": BIASED,
 }
 """Sensors of the map."""
-DURATIONS_S = (20.0, 40.0, 80.0, 120.0)
-"""Times of flight over which errors are averaged [s]."""
+DURATIONS_S = (20.0, 40.0, 80.0)
+"""Times of flight over which errors are averaged, beside the whole flight [s]."""
 
 
 class PathInput(NamedTuple):
@@ -76,7 +76,7 @@ def ratio_map(config: ArekfConfig) -> RatioMap:
 
     over_factors = jax.vmap(squares, in_axes=(None, None, 0))
     found = np.asarray(jax.jit(jax.vmap(over_factors, in_axes=(0, 0, None)))(truth, sigma, factors))
-    durations = [at for at in DURATIONS_S if at <= config.duration_s] or [config.duration_s]
+    durations = [*(at for at in DURATIONS_S if at < config.duration_s), config.duration_s]
     steps = [round(at / config.filter_period_s) for at in durations]
     level = np.sqrt(np.stack([found[:, :, :k].mean(axis=2) for k in steps], axis=2))
     matched = config.factors.index(1.0)

@@ -18,6 +18,16 @@ WIDTHS = {"ekf": 2.6, "mmae": 2.4, "arekf": 1.8, "oracle": 1.0}
 """Line widths where lines lie on one another: the lower ones are wider."""
 
 
+OWN_SENSOR = (
+    "arw_deg_sqrt_h",
+    "vrw_m_s_sqrt_h",
+    "gyro_drift_deg_h",
+    "accel_bias_mg",
+    "gnss_velocity",
+)
+"""Fields of the configuration that make another sensor than that of the map's first row."""
+
+
 def draw(result: StudyResult, directory: Path) -> list[Path]:
     """Draw the figures of one scenario.
 
@@ -103,7 +113,8 @@ def _told(result: StudyResult) -> str:
 def _draw_anees(result: StudyResult, path: Path) -> None:
     """ANEES of all states over time, with the bounds of a consistent filter."""
     a = result.arrays
-    low, high = chi2_mean_bounds(15, result.runs)
+    states = next(iter(result.methods.values()))["anees_dof"]
+    low, high = chi2_mean_bounds(states, result.runs)
     with figure(path, (7.5, 4.5)) as drawing:
         axes = drawing.subplots()
         axes.axhspan(low, high, color="0.85", label="consistent")
@@ -112,7 +123,7 @@ def _draw_anees(result: StudyResult, path: Path) -> None:
         axes.set_yscale("log")
         axes.margins(x=0)
         axes.set_xlabel("time of flight [s]")
-        axes.set_ylabel("ANEES of 15 states")
+        axes.set_ylabel(f"ANEES of {states} states")
         axes.legend(ncols=3, fontsize=8)
         axes.set_title(_told(result))
 
@@ -137,7 +148,7 @@ def _draw_ratio(result: StudyResult, path: Path) -> None:
                 capsize=3,
                 label="EKF over AREKF, 95 %",
             )
-            if "map_ratio" in a:
+            if "map_ratio" in a and not any(result.config[name] for name in OWN_SENSOR):
                 expected = a["map_ratio"][0, :, -1, j]
                 axes.plot(a["factor"], expected, ":", color="0.3", label="EKF by covariance")
             axes.set_xscale("log")

@@ -52,7 +52,6 @@ class Shared(NamedTuple):
     Attributes:
         world: The world.
         given: Noise that the filters were given.
-        factor: True noise of the inertial sensors over that which was given.
         kernel: Numbers of the Versoria filter.
         adaptation: Numbers of the innovation-based adaptation.
         settle: Time of flight from which errors count [s].
@@ -60,7 +59,6 @@ class Shared(NamedTuple):
 
     world: World
     given: SinsGnssParams
-    factor: Array
     kernel: Versoria
     adaptation: Adaptation
     settle: Array
@@ -103,10 +101,10 @@ def shared_of(config: ArekfConfig, world: World, factor: float) -> Shared:
         gyro_noise=world.noise.gyro_noise / factor, accel_noise=world.noise.accel_noise / factor
     )
     kernel = Versoria(jnp.array(config.versoria_width), jnp.array(config.versoria_power))
-    adaptation = Adaptation(jnp.array(config.iae_memory), jnp.array(1e-2), jnp.array(1e4))
+    adaptation = Adaptation(*(jnp.array(x) for x in Adaptation(config.iae_memory)))
     late = config.scenario == "large-heading-error"
     settle = jnp.array(config.settle_s if late else 0.0)
-    return Shared(world, given, jnp.array(factor), kernel, adaptation, settle)
+    return Shared(world, given, kernel, adaptation, settle)
 
 
 @cache

@@ -220,7 +220,7 @@ def _arrays(
             ("run", "estimator", "kind", "axis"),
         ),
         "convergence": (campaign.rows.convergence, ("run", "estimator", "kind")),
-        "identified": (campaign.rows.identified[:, 0], ("run", "sensor", "axis")),
+        "identified": (campaign.rows.identified[:, 0], ("run", "sensor", "body_axis")),
         "estimator": (np.array(names), ("estimator",)),
         "kind": (np.array(KINDS), ("kind",)),
         "axis": (np.array(AXES), ("axis",)),
