@@ -198,7 +198,7 @@ def test_permission_error_is_refused(write, monkeypatch):
 
     path = write(epoch())
     monkeypatch.setattr(Path, "read_text", deny)
-    with pytest.raises(DataError, match=r"log\.pos: permission denied; accepted"):
+    with pytest.raises(DataError, match=r"log\.txt: permission denied; accepted"):
         load_rtklib_pos(path)
 
 
