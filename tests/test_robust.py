@@ -15,7 +15,7 @@ from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.robust import Correntropy, Versoria, correntropy, versoria
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.run import run, simulate
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Model, Obs
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Model, NonAdditive, Obs
 from tests.oracles.kalman import Linear
 from tests.oracles.matrices import central_difference, random_spd
 from tests.oracles.robust import adapted, correntropy_weight, reweighted, versoria_weight
@@ -193,6 +193,20 @@ def test_gradients_by_the_kernel_are_right_also_at_a_zero_residual() -> None:
     np.testing.assert_array_equal(by_kernel[1], 0)
     gain = P @ np.linalg.inv(P + R)
     np.testing.assert_allclose(by_data[1], 2 * direction @ gain, rtol=1e-12)
+
+
+def test_noise_that_does_not_add_is_refused() -> None:
+    noisy = NonAdditive(lambda p, x, v, u: x + v, lambda p, x, u: jnp.ones(1))
+    one = Model(
+        transition=lambda p, x, u: x,
+        process_noise=lambda p, x, u: jnp.eye(1),
+        observe=lambda p, x, u: x,
+        observation_noise=lambda p, x, u: jnp.ones(1),
+        noisy=noisy,
+    )
+    for build in (versoria, correntropy):
+        with pytest.raises(ValueError, match="noise that does not add"):
+            build(ekf, one)
 
 
 def test_a_robust_update_needs_an_iteration() -> None:

@@ -110,6 +110,12 @@ def _told(result: StudyResult) -> str:
     return f"{result.scenario}{drift}, {result.runs} runs"
 
 
+def _legend_below(drawing: Any, axes: Any) -> None:
+    """Put the legend of some axes under the figure, where it covers no line."""
+    handles, labels = axes.get_legend_handles_labels()
+    drawing.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
+
+
 def _draw_anees(result: StudyResult, path: Path) -> None:
     """ANEES of all states over time, with the bounds of a consistent filter."""
     a = result.arrays
@@ -124,7 +130,7 @@ def _draw_anees(result: StudyResult, path: Path) -> None:
         axes.margins(x=0)
         axes.set_xlabel("time of flight [s]")
         axes.set_ylabel(f"ANEES of {states} states")
-        axes.legend(ncols=3, fontsize=8)
+        _legend_below(drawing, axes)
         axes.set_title(_told(result))
 
 
@@ -157,7 +163,7 @@ def _draw_ratio(result: StudyResult, path: Path) -> None:
             axes.set_xlabel("true noise over that given")
             axes.set_title(str(kind))
         panels[0].set_ylabel("RMSE over that of the oracle")
-        panels[0].legend(fontsize=7)
+        _legend_below(drawing, panels[0])
         drawing.suptitle(f"{result.scenario}, {result.runs} runs")
 
 
