@@ -1,6 +1,6 @@
 """Strict settings for the whole suite: float64, no silent promotion, two host devices."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,17 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def programs_end_with_their_module() -> Iterator[None]:
+    """Drop the compiled programs of a module after its last test.
+
+    Each program on a CPU holds several memory mappings, and a process may hold 65,530 of them
+    (`vm.max_map_count`): past that the compiler dies of a segmentation fault.
+    """
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

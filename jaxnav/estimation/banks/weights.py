@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.types import Info, WeightRule
+from jaxnav.estimation.types import Flag, Info, WeightRule
 
 
 def normalise(log_weights: Array) -> Array:
@@ -93,6 +93,65 @@ def bayes() -> WeightRule:
         return state, _bayes_step(log_weights, info)
 
     return WeightRule(_stateless, _stay, update)
+
+
+class Penalty(NamedTuple):
+    """Parameters of :func:`penalty`: ``rho(k) = least + scale k^exponent exp(-k / memory)``.
+
+    The default is the increasing penalty of the paper, ``0.5 k^0.15``, without normaliser;
+    ``Penalty(0.5, 0.0, normaliser=1.0)`` is Bayes' rule, a finite ``memory`` the decaying penalty.
+
+    Attributes:
+        scale: Zero or above.
+        exponent: How fast it grows with the count of observations.
+        memory: Observations over which it decays by ``e``; infinite, it does not.
+        least: What it decays to.
+        normaliser: Power ``gamma`` of ``|2 pi S|^(-1/2)``: zero as in the paper, one for Bayes.
+    """
+
+    scale: Array | float = 0.5
+    exponent: Array | float = 0.15
+    memory: Array | float = jnp.inf
+    least: Array | float = 0.0
+    normaliser: Array | float = 0.0
+
+
+def penalty() -> WeightRule:
+    """Return the penalty-weighted rule; parameters are :class:`Penalty`.
+
+        log w <- log w - rho(k) nu' inv(S) nu - (gamma / 2) log |2 pi S|
+
+    with ``k`` the count of observations from 1, so that a faster clock of the filter alone changes
+    nothing; a faster receiver does. Without the normaliser the member with the largest ``S``, that
+    is with the largest noise, is always ahead in the mean: each step's expectation is
+    ``-rho tr(inv(S) S_true)``, which no true model maximises. With ``rho`` above 1/2 and the
+    normaliser the weights are overconfident; ``gamma = 2 rho`` would temper both alike.
+
+    References:
+        Song et al. (2022), Sensors 22:5976, Eqs. (26)-(27), who leave the normaliser out as being
+        without effect. The decaying penalty is that of their reference [29], whose numbers they do
+        not give.
+    """
+
+    def init(params: Penalty, log_weights: Array) -> Array:
+        del params
+        return jnp.zeros((), log_weights.dtype)
+
+    def update(
+        params: Penalty, state: Array, log_weights: Array, info: Info, k: Array
+    ) -> tuple[Array, Array]:
+        del k
+        heard = jnp.any(active(log_weights) & (info.flags & Flag.NO_OBSERVATION == 0))
+        count = state + heard.astype(state.dtype)
+        step = jnp.maximum(count, 1)
+        grown = params.scale * step**params.exponent * jnp.exp(-step / params.memory)
+        usable = jnp.isfinite(info.log_likelihood)
+        normaliser = jnp.where(usable, info.log_likelihood, 0) + 0.5 * info.nis
+        evidence = params.normaliser * normaliser - (params.least + grown) * info.nis
+        told = info._replace(log_likelihood=jnp.where(usable, evidence, -jnp.inf))
+        return count, _bayes_step(log_weights, told)
+
+    return WeightRule(init, _stay, update)
 
 
 def floor() -> WeightRule:
@@ -300,6 +359,6 @@ def chain(*rules: WeightRule) -> WeightRule:
 
 RULES: dict[str, Callable[..., WeightRule]] = {
     rule.__name__: rule
-    for rule in (fixed, bayes, floor, forget, markov, switch, windowed_reset, chain)
+    for rule in (fixed, bayes, penalty, floor, forget, markov, switch, windowed_reset, chain)
 }
 """The rules by name, for listing."""

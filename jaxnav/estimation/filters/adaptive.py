@@ -76,14 +76,8 @@ def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filte
         own = Adaptation() if params.adaptation == () else params.adaptation
         R = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
         inner, info = base.update(given(params, 1.0, R), state.inner, u, obs)
-        S = jnp.diag(info.innovation_cov)
-        told = obs.valid & (S > 0)
-        ratio = info.innovation**2 / jnp.where(told, S, 1)
-        excess = jnp.where(told, jnp.minimum(ratio, LARGEST_RATIO) - MEAN_RATIO, 0)
-        channels = jnp.maximum(jnp.sum(told), 1).astype(S.dtype)
-        step = jnp.sum(excess) / channels / own.memory
-        moved = jnp.clip(state.log_factor + step, jnp.log(own.low), jnp.log(own.high))
-        return AdaptiveState(inner, moved.astype(S.dtype)), info
+        moved = moved_log_factor(own, state.log_factor, info, obs)
+        return AdaptiveState(inner, moved), info
 
     def estimate(state: AdaptiveState) -> Gaussian:
         return base.estimate(state.inner)
@@ -92,3 +86,21 @@ def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filte
         return state._replace(inner=base.restart(state.inner, estimate))
 
     return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+
+
+def moved_log_factor(own: Adaptation, log_factor: Array, info: Info, obs: Obs) -> Array:
+    """Return the logarithm of the factor on the process noise after an update.
+
+    Args:
+        own: Parameters of the adaptation.
+        log_factor: Before.
+        info: Of the update.
+        obs: Its observation.
+    """
+    S = jnp.diag(info.innovation_cov)
+    told = obs.valid & (S > 0)
+    ratio = info.innovation**2 / jnp.where(told, S, 1)
+    excess = jnp.where(told, jnp.minimum(ratio, LARGEST_RATIO) - MEAN_RATIO, 0)
+    channels = jnp.maximum(jnp.sum(told), 1).astype(S.dtype)
+    step = jnp.sum(excess) / channels / own.memory
+    return jnp.clip(log_factor + step, jnp.log(own.low), jnp.log(own.high)).astype(S.dtype)

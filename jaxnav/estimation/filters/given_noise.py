@@ -45,3 +45,14 @@ def with_given_noise(model: Model) -> Model:
 def given(params: FilterParams, process: Array | float, observation: Array | float) -> FilterParams:
     """Return a filter's parameters with the noise handed to its model."""
     return params._replace(model=GivenNoise(params.model, process, observation))
+
+
+def require_additive(model: Model, who: str) -> None:
+    """Raise ``ValueError`` if the model has ``noisy``, which a filter uses in place of a given R.
+
+    Args:
+        model: The model.
+        who: What cannot do with it, for the message.
+    """
+    if model.noisy is not None:
+        raise ValueError(f"the model has noise that does not add; {who} needs one that does")

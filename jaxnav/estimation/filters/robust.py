@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.given_noise import given, with_given_noise
+from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
 from jaxnav.estimation.filters.innovation import masked_innovation, noise_of_channels
 from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower
@@ -110,10 +110,7 @@ def _reweighted(
     """
     if iterations < 1:
         raise ValueError(f"iterations is {iterations}; a robust update needs at least 1")
-    if model.noisy is not None:
-        raise ValueError(
-            "the model has noise that does not add; a robust filter needs one that does"
-        )
+    require_additive(model, "a robust filter")
     base = build(with_given_noise(model))
 
     def predict(params: FilterParams, state: Any, u: Input) -> Any:

@@ -1,0 +1,204 @@
+"""Sage-Husa filters: measurement noise that is estimated from the innovations as they come.
+
+The estimate forgets: with the factor ``b`` the sample of step ``k`` enters with
+
+    d_k = (1 - b) / (1 - b^(k + 1 + c)),   R <- (1 - d_k) R + d_k sample,
+
+where ``c`` counts samples that the start is worth. With the model's ``R = L L'`` what is estimated
+is ``N`` in ``L N L'``, one at the start: a receiver that grades its fixes is believed in
+proportion, and with a constant ``R`` in the model the recursion is the papers'.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.filters.adaptive import Adaptation, moved_log_factor
+from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
+from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, noise_of_channels
+from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
+from jaxnav.numerics.linalg import cholesky, matmul, solve_lower, symmetrise
+
+NoiseForm = Literal["clamped", "residual", "printed"]
+FORMS: tuple[NoiseForm, ...] = ("clamped", "residual", "printed")
+
+
+class SageHusa(NamedTuple):
+    """Parameters of :func:`sage_husa`.
+
+    Attributes:
+        forgetting: ``b`` in (0, 1]; with one, all samples count alike.
+        prior_count: ``c``, zero or more: samples that the model's own noise counts for at the
+            start. Zero is the papers' choice, whose first sample replaces it; infinite makes
+            ``d = 1 - b`` from the start.
+        low: Smallest variance of a channel over the model's own, above zero; of the clamped form.
+        high: Largest.
+        temperature: Width of the smooth clamp, in the same unit; not used by the hard one.
+        process: :class:`~jaxnav.estimation.filters.adaptive.Adaptation` of the process noise;
+            ``()`` leaves it as the model has it.
+    """
+
+    forgetting: Array | float = 0.97
+    prior_count: Array | float = 10.0
+    low: Array | float = 0.1
+    high: Array | float = 100.0
+    temperature: Array | float = 0.02
+    process: Any = ()
+
+
+class SageHusaState(NamedTuple):
+    """State of the filter and of its noise estimate.
+
+    Attributes:
+        inner: That of the wrapped filter.
+        noise: ``(m, m)`` the estimated ``N``.
+        count: ``(m,)`` observations of each channel.
+        log_factor: Logarithm of the factor on the process noise.
+    """
+
+    inner: Any
+    noise: Array
+    count: Array
+    log_factor: Array
+
+
+def sage_husa(
+    build: Callable[[Model], Filter],
+    model: Model,
+    *,
+    channels: int,
+    form: NoiseForm = "clamped",
+    smooth: bool = False,
+) -> Filter:
+    """Return a filter that estimates its measurement noise, a wrapper of any other.
+
+    The samples, with innovation ``nu`` of covariance ``S = H P H' + R``:
+
+    * "printed": ``nu nu' - H P H'``, which is indefinite more often than not, and so may ``R``
+      become: :attr:`~jaxnav.estimation.types.Flag.INDEFINITE` is raised when it is, and an update
+      with it is skipped if ``S`` is not positive definite either.
+    * "clamped": its diagonal, and the estimate kept in ``[low, high]`` times the model's.
+    * "residual": ``e e' + H P+ H'`` with the residual ``e = z - h(x+)`` after the update; a sum of
+      squares, so that ``R`` stays positive definite.
+
+    Channels that did not arrive keep their noise. A channel that arrives alone is averaged at its
+    own pace, by ``R <- a R a + s sample s`` with ``a = diag(sqrt(1 - d))``, ``s = diag(sqrt(d))``,
+    which keeps ``R`` positive definite too.
+
+    Args:
+        build: The filter to make adaptive; any of this library that takes a model.
+        model: The model.
+        channels: Number of channels ``m`` of the model's observation.
+        form: The sample.
+        smooth: Clamp by softplus functions, for gradients.
+
+    Raises:
+        ValueError: If there is no such form, or the model has noise that does not just add.
+
+    References:
+        Sage and Husa (1969); Song et al. (2022), Sensors 22:5976, Eqs. (20)-(22). The paper updates
+        with the ``R`` that has seen the innovation of the step; here the update is made with that of
+        the step before, so that the info tells the likelihood of the data given the past, which a
+        bank weighs by, and ``S - R`` is ``H P H'`` of any filter. ``d_0 = 1`` of the paper, which
+        throws the start away, is ``prior_count = 0``. Eq. (22) takes ``H`` at the updated state; it
+        is that of the predicted one.
+    """
+    if form not in FORMS:
+        raise ValueError(f"form is {form!r}; it must be one of {', '.join(FORMS)}")
+    require_additive(model, "a filter that estimates measurement noise")
+    base = build(with_given_noise(model))
+
+    def init(params: FilterParams) -> SageHusaState:
+        dtype = params.initial.cov.dtype
+        unit, none = jnp.eye(channels, dtype=dtype), jnp.zeros((channels,), dtype)
+        return SageHusaState(base.init(params), unit, none, jnp.zeros((), dtype))
+
+    def predict(params: FilterParams, state: SageHusaState, u: Input) -> SageHusaState:
+        scaled = given(params, jnp.exp(state.log_factor), 0.0)
+        return state._replace(inner=base.predict(scaled, state.inner, u))
+
+    def update(
+        params: FilterParams, state: SageHusaState, u: Input, obs: Obs
+    ) -> tuple[SageHusaState, Info]:
+        own = SageHusa() if params.adaptation == () else params.adaptation
+        nominal = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
+        L, N = cholesky(nominal).factor, mask_noise(state.noise, obs.valid)
+        R = symmetrise(matmul(matmul(L, N), L.T))
+        inner, info = base.update(given(params, 1.0, R), state.inner, u, obs)
+        S = symmetrise(_whitened(L, _whitened(L, info.innovation_cov).T))
+        if form == "residual":
+            after = model.observe(params.model, base.estimate(inner).mean, u)
+            e = solve_lower(L, masked_innovation(model, obs, after))
+            sample = e[:, None] * e[None, :] + _spread_after(N, S)
+        else:
+            e = solve_lower(L, info.innovation)
+            sample = e[:, None] * e[None, :] - (S - N)
+        told = obs.valid & jnp.isfinite(info.log_likelihood)
+        noise = _averaged(own, state, sample, told)
+        if form == "clamped":
+            noise = jnp.diag(_clamped(own, jnp.diag(noise), smooth))
+        if form == "printed":
+            lost = ~cholesky(N).positive_definite
+            info = info._replace(flags=info.flags | _flag(Flag.INDEFINITE, lost))
+        moved = state.log_factor
+        if own.process != ():
+            moved = moved_log_factor(own.process, moved, info, obs)
+        count = state.count + told.astype(state.count.dtype)
+        return SageHusaState(inner, noise, count, moved), info
+
+    def estimate(state: SageHusaState) -> Gaussian:
+        return base.estimate(state.inner)
+
+    def restart(state: SageHusaState, estimate: Gaussian) -> SageHusaState:
+        return state._replace(inner=base.restart(state.inner, estimate))
+
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+
+
+def averaging(forgetting: Array | float, count: Array) -> Array:
+    """Return ``d = (1 - b) / (1 - b^(n + 1))`` for ``n`` earlier samples, ``1 / (n + 1)`` at one.
+
+    Args:
+        forgetting: ``b`` in (0, 1].
+        count: ``n``, of any shape; infinite gives ``1 - b``.
+    """
+    b = jnp.asarray(forgetting, count.dtype)
+    fades = b < 1
+    rate = jnp.log(jnp.where(fades, b, 0.5))
+    faded = jnp.expm1(rate) / jnp.expm1((count + 1) * rate)
+    return jnp.where(fades, faded, 1 / (count + 1))
+
+
+def _averaged(own: SageHusa, state: SageHusaState, sample: Array, told: Array) -> Array:
+    """Return the noise estimate with a sample ``(m, m)`` in the channels that told something."""
+    share = averaging(own.forgetting, state.count + own.prior_count)
+    d = jnp.where(told, share, 0)
+    kept = jnp.where(d < 1, jnp.sqrt(jnp.where(d < 1, 1 - d, 1)), 0)
+    used = jnp.where(told, jnp.sqrt(jnp.where(told, share, 1)), 0)
+    known = jnp.where(told[:, None] & told[None, :], sample, 0)
+    return kept[:, None] * state.noise * kept[None, :] + used[:, None] * known * used[None, :]
+
+
+def _clamped(own: SageHusa, variance: Array, smooth: bool) -> Array:
+    if not smooth:
+        return jnp.clip(variance, own.low, own.high)
+    above, below = ((variance - bound) / own.temperature for bound in (own.low, own.high))
+    return own.low + own.temperature * (jax.nn.softplus(above) - jax.nn.softplus(below))
+
+
+def _whitened(L: Array, A: Array) -> Array:
+    """Return ``inv(L) A`` of a matrix."""
+    return jax.vmap(solve_lower, in_axes=(None, 1), out_axes=1)(L, A)
+
+
+def _spread_after(N: Array, S: Array) -> Array:
+    """Return ``H P+ H' = N - N inv(S) N``, all in units of the model's noise."""
+    A = _whitened(cholesky(S).factor, N)
+    return symmetrise(N - matmul(A.T, A))
+
+
+def _flag(flag: Flag, on: Array) -> Array:
+    return jnp.where(on, int(flag), 0).astype(jnp.int32)
