@@ -41,6 +41,13 @@ COLOURS = {
     "versoria-ekf": "tab:purple",
     "iae": "tab:brown",
     "arekf": "tab:blue",
+    "sage-husa": "tab:green",
+    "exponential-decay": "tab:purple",
+    "proposed": "tab:blue",
+    "proposed-bayes": "tab:olive",
+    "proposed-bayes-floor": "tab:cyan",
+    "unnormalised-floor": "tab:brown",
+    "oracle-r": "0.5",
     "oracle": "black",
 }
 """Colour of each method, the same in all figures."""

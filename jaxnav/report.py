@@ -89,11 +89,9 @@ def _method_table(result: StudyResult) -> Table:
         title=f"{result.study}, {result.scenario}: {result.runs} runs, seed {result.seed}"
     )
     table.add_column("method")
-    columns: dict[str, str] = {}
+    columns: dict[str, None] = {}
     for measures in result.methods.values():
-        for name, measure in measures.get("rmse", {}).items():
-            if "of" not in measure:
-                columns[name] = measure["unit"]
+        columns |= dict.fromkeys(_shown(measures))
     scalars = list(
         dict.fromkeys(
             name
@@ -102,14 +100,28 @@ def _method_table(result: StudyResult) -> Table:
             if isinstance(value, int | float) and name not in NOT_SHOWN
         )
     )
-    for name, unit in columns.items():
-        table.add_column(escape(f"RMSE {name} [{unit}]"), justify="right")
+    for name in columns:
+        table.add_column(escape(name), justify="right")
     for name in scalars:
         table.add_column(name.replace("_", " "), justify="right")
     for method, measures in result.methods.items():
-        errors = [_with_error(measures.get("rmse", {}).get(name)) for name in columns]
+        shown = _shown(measures)
+        errors = [_with_error(shown.get(name)) for name in columns]
         table.add_row(method, *errors, *(_number(measures.get(name)) for name in scalars))
     return table
+
+
+def _shown(measures: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the errors of a method by the heading of their column."""
+    errors = {
+        f"RMSE {name} [{measure['unit']}]": measure
+        for name, measure in measures.get("rmse", {}).items()
+        if "of" not in measure
+    }
+    for axis, spans in measures.get("mse", {}).items():
+        for span, measure in spans.items():
+            errors[f"MSE {axis} [{measure['unit']}] {span} s"] = measure
+    return errors
 
 
 def _with_error(measure: dict[str, Any] | None) -> str:

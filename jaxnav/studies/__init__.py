@@ -66,6 +66,14 @@ STUDIES = {
         scenarios="jaxnav.studies.arekf.config:SCENARIOS",
         check="jaxnav.studies.base:check_simulated",
     ),
+    "sage-husa": Study(
+        summary="a vehicle's INS/GNSS whose fixes turn noisy: Sage-Husa UKF in banks (Song et al.)",
+        config="jaxnav.studies.sage_husa.config:SageHusaConfig",
+        entry="jaxnav.studies.sage_husa.study:run_study",
+        figures="jaxnav.studies.sage_husa.figures:draw",
+        scenarios="jaxnav.studies.sage_husa.config:SCENARIOS",
+        check="jaxnav.studies.base:check_simulated",
+    ),
     "gnss-track": Study(
         summary="a recorded GNSS track through the same bank, judged by predictive likelihood",
         config="jaxnav.studies.gnss_track.config:GnssTrackConfig",

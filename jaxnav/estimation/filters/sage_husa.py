@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.adaptive import Adaptation, moved_log_factor
+from jaxnav.estimation.filters.adaptive import moved_log_factor
 from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
 from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, noise_of_channels
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
@@ -55,13 +55,13 @@ class SageHusaState(NamedTuple):
     Attributes:
         inner: That of the wrapped filter.
         noise: ``(m, m)`` the estimated ``N``.
-        count: ``(m,)`` observations of each channel.
+        samples: ``(m,)`` observations of each channel.
         log_factor: Logarithm of the factor on the process noise.
     """
 
     inner: Any
     noise: Array
-    count: Array
+    samples: Array
     log_factor: Array
 
 
@@ -100,9 +100,9 @@ def sage_husa(
 
     References:
         Sage and Husa (1969); Song et al. (2022), Sensors 22:5976, Eqs. (20)-(22). The paper updates
-        with the ``R`` that has seen the innovation of the step; here the update is made with that of
-        the step before, so that the info tells the likelihood of the data given the past, which a
-        bank weighs by, and ``S - R`` is ``H P H'`` of any filter. ``d_0 = 1`` of the paper, which
+        with the ``R`` that has seen the innovation of the step; here the update is made with that
+        of the step before, so that the info tells the likelihood of the data given the past, which
+        a bank weighs by, and ``S - R`` is ``H P H'`` of any filter. ``d_0 = 1`` of the paper, which
         throws the start away, is ``prior_count = 0``. Eq. (22) takes ``H`` at the updated state; it
         is that of the predicted one.
     """
@@ -146,8 +146,8 @@ def sage_husa(
         moved = state.log_factor
         if own.process != ():
             moved = moved_log_factor(own.process, moved, info, obs)
-        count = state.count + told.astype(state.count.dtype)
-        return SageHusaState(inner, noise, count, moved), info
+        samples = state.samples + told.astype(state.samples.dtype)
+        return SageHusaState(inner, noise, samples, moved), info
 
     def estimate(state: SageHusaState) -> Gaussian:
         return base.estimate(state.inner)
@@ -174,7 +174,7 @@ def averaging(forgetting: Array | float, count: Array) -> Array:
 
 def _averaged(own: SageHusa, state: SageHusaState, sample: Array, told: Array) -> Array:
     """Return the noise estimate with a sample ``(m, m)`` in the channels that told something."""
-    share = averaging(own.forgetting, state.count + own.prior_count)
+    share = averaging(own.forgetting, state.samples + own.prior_count)
     d = jnp.where(told, share, 0)
     kept = jnp.where(d < 1, jnp.sqrt(jnp.where(d < 1, 1 - d, 1)), 0)
     used = jnp.where(told, jnp.sqrt(jnp.where(told, share, 1)), 0)

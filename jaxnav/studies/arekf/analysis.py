@@ -16,7 +16,8 @@ from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.studies.arekf.config import BIASED, NOISY, ArekfConfig
-from jaxnav.studies.arekf.simulation import build_world, noise_of, prior_sigma, true_states
+from jaxnav.studies.arekf.simulation import build_world, noise_of, prior_sigma
+from jaxnav.studies.level_sins import true_states
 
 GRADES = {
     "noise-dominated": NOISY,

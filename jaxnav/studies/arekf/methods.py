@@ -233,7 +233,7 @@ def judge(
     consistency = jax.vmap(nees)(own, estimates.cov)
     squares = blocks**2
     norms = jnp.sum(squares, axis=2)
-    period = setup.timing.steps_per_record * setup.timing.samples_per_step * setup.timing.imu_step
+    period = setup.timing.steps_per_record * setup.timing.clock.step
     time = period * jnp.arange(1, count + 1, dtype=norms.dtype)
     counted = time > shared.settle
     share = counted.astype(norms.dtype)[:, None, None] / jnp.sum(counted).astype(norms.dtype)

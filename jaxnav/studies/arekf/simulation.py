@@ -8,16 +8,15 @@ from jax import Array
 
 from jaxnav.estimation.types import Gaussian, Obs
 from jaxnav.navigation.earth import earth_rate, normal_gravity
-from jaxnav.navigation.models.level_errors import SinsLevel, error_form
-from jaxnav.navigation.models.sins_cns import LAYOUT
+from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.sensors.allan import allan_variance, cluster_sizes, slope_rule
 from jaxnav.navigation.sensors.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
-from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.trajectory.arc import ArcProfile, fly_arc
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.studies.arekf.config import ArekfConfig, Sensor
+from jaxnav.studies.level_sins import Clock, sense
 from jaxnav.units import DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
 
 LONGEST_CLUSTER_S = 0.35
@@ -43,8 +42,7 @@ class World(NamedTuple):
 class Timing(NamedTuple):
     """What fixes the shape of a flight: the static part of a configuration."""
 
-    imu_step: float
-    samples_per_step: int
+    clock: Clock
     steps_per_fix: int
     steps_per_record: int
     static_samples: int
@@ -71,8 +69,7 @@ class Run(NamedTuple):
 def timing_of(config: ArekfConfig) -> Timing:
     """Return the static part of a configuration that a flight depends on."""
     return Timing(
-        config.imu_step,
-        config.samples_per_step,
+        Clock(config.imu_step, config.samples_per_step),
         config.steps_per_fix,
         config.steps_per_record,
         config.static_samples,
@@ -140,68 +137,37 @@ def fly_run(key: Array, world: World, timing: Timing) -> Run:
         timing: Rates and periods.
     """
     start_key, static_key, imu_key, gnss_key = jax.random.split(key, 4)
-    # A product with a matrix, not with a vector: XLA fuses the latter, and with it the generator,
-    # into every sample of the IMU that the drawn drift and bias go to.
-    sigma = world.prior_sigma
-    error0 = jnp.diag(sigma) @ jax.random.normal(start_key, sigma.shape, sigma.dtype)
-    # The filters start at no drift and no bias, so the truth is the opposite of the error.
-    drift, bias = -error0[LAYOUT.eps], -error0[LAYOUT.nabla]
-    errors = _imu_errors(world.noise, drift, bias, timing.imu_step)
-    motion, every = world.trajectory, timing.samples_per_step
-    quiet = jnp.ones(motion.dtheta.shape[0], sigma.dtype)
-    turns, gains = corrupt(imu_key, errors, motion.dtheta, motion.dvel, timing.imu_step, quiet)
-    dtheta, gain = accumulate(turns, gains, every)
-    steps = dtheta.shape[0]
-    truth = true_states(motion, every, drift, bias)
-    first, after = (jax.tree.map(lambda leaf, at=at: leaf[at], truth) for at in (0, slice(1, None)))
-    z = observe_gnss(gnss_key, after.velocity, after.position, world.fixes)
+    seen = sense(start_key, imu_key, world.trajectory, world.noise, world.prior_sigma, timing.clock)
+    steps = seen.inputs.dt.shape[0]
+    z = observe_gnss(gnss_key, seen.truth.velocity, seen.truth.position, world.fixes)
     arrived = jnp.arange(1, steps + 1) % timing.steps_per_fix == 0
     records = slice(timing.steps_per_record - 1, None, timing.steps_per_record)
     return Run(
-        start=Gaussian(
-            error_form("additive", first.position).retract(first, error0), jnp.diag(sigma**2)
-        ),
-        identified=_identified(static_key, world, errors, timing),
-        inputs=SinsGnssInput(
-            dtheta,
-            gain,
-            turns[every - 1 :: every] / timing.imu_step,
-            jnp.full(steps, every * timing.imu_step, sigma.dtype),
-        ),
+        start=seen.start,
+        identified=_identified(static_key, world, seen.errors, timing),
+        inputs=seen.inputs,
         fixes=Obs(z, jnp.broadcast_to(arrived[:, None], z.shape)),
-        truth=jax.tree.map(lambda leaf: leaf[records], after),
+        truth=jax.tree.map(lambda leaf: leaf[records], seen.truth),
     )
-
-
-def true_states(motion: Trajectory, every: int, drift: Array, bias: Array) -> SinsLevel:
-    """Return the true states at the ends of the filter's steps, the start first."""
-    at = jax.tree.map(lambda leaf: leaf[::every], motion.state)
-    shape = at.velocity.shape
-    constant = jnp.broadcast_to(drift, shape), jnp.broadcast_to(bias, shape)
-    return SinsLevel(at.dcm, at.velocity, at.position, *constant)
-
-
-def _imu_errors(noise: SinsGnssParams, drift: Array, bias: Array, step: float) -> ImuErrors:
-    per_sample = step**-0.5
-    return ImuErrors(noise.gyro_noise * per_sample, noise.accel_noise * per_sample, drift, bias)
 
 
 def _identified(key: Array, world: World, errors: ImuErrors, timing: Timing) -> tuple[Array, Array]:
     """Return the random walks ``(3,)`` of gyros and accelerometers that a record at rest shows."""
+    step = timing.clock.imu_step
     pad = jax.tree.map(lambda leaf: leaf[0], world.trajectory.state)
     latitude, height = pad.position[0], pad.position[2]
     up = normal_gravity(latitude, height) * jnp.array([0.0, 0.0, 1.0], latitude.dtype)
     still = pad.dcm.T @ earth_rate(latitude), pad.dcm.T @ up
     shape = (timing.static_samples, 3)
-    at_rest = [jnp.broadcast_to(timing.imu_step * mean, shape) for mean in still]
+    at_rest = [jnp.broadcast_to(step * mean, shape) for mean in still]
     quiet = jnp.ones(shape[0], latitude.dtype)
-    increments = corrupt(key, errors, at_rest[0], at_rest[1], timing.imu_step, quiet)
-    longest = LONGEST_CLUSTER_S / (timing.static_samples * timing.imu_step)
+    increments = corrupt(key, errors, at_rest[0], at_rest[1], step, quiet)
+    longest = LONGEST_CLUSTER_S / (timing.static_samples * step)
     sizes = cluster_sizes(timing.static_samples, longest=longest)
 
     def walk(samples: Array) -> Array:
-        rate = samples / timing.imu_step
-        return slope_rule(allan_variance(rate, timing.imu_step, sizes))
+        rate = samples / step
+        return slope_rule(allan_variance(rate, step, sizes))
 
     gyro, accel = (jax.vmap(walk, in_axes=1)(samples) for samples in increments)
     return gyro, accel

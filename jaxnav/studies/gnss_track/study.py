@@ -10,7 +10,8 @@ import numpy as np
 from jax import Array
 
 from jaxnav.datasets.base import DataError
-from jaxnav.datasets.rtklib import GnssTrack, gaps, intervals_s, load_rtklib_pos, thin
+from jaxnav.datasets.rtklib import load_rtklib_pos
+from jaxnav.datasets.track import GnssTrack, gaps, intervals_s, thin
 from jaxnav.estimation.banks.mixture import BankParams, panel
 from jaxnav.estimation.banks.weights import (
     WindowedReset,
