@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxnav.datasets.base import DataError
-from jaxnav.datasets.rtklib import GnssTrack, gaps, intervals_s, load_rtklib_pos, thin
+from jaxnav.datasets.rtklib import load_rtklib_pos
+from jaxnav.datasets.track import GnssTrack, gaps, intervals_s, thin
 
 REAL_FILE = (
     Path(__file__).resolve().parents[2] / "shared" / "data" / "rtk_drive" / "gnss_1934_sf.pos"

@@ -1,15 +1,19 @@
-"""Does a recorded inertial log look like what its units say?"""
+"""Do recorded samples and fixes look like what their units say?"""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxnav.datasets.base import DataError
-from jaxnav.units import GRAVITY
+from jaxnav.navigation.earth import MEAN_RADIUS
+from jaxnav.units import DEG, GRAVITY
 
 _SEVERAL_AXES = 35.0
 _ONE_AXIS = 350.0
 _TURNING = 0.3
 _MISMATCH = 8.0
+_HEIGHTS = (-1e3, 1e5)
+_STRETCH_S = 10.0
+_FAR = 30.0
 _LOOKS = {"g": 1.0, "m/s^2 where the header says g": GRAVITY**2, "mg": 1000.0}
 
 
@@ -42,6 +46,70 @@ def check_plausible(gyro: NDArray[np.float64], accel: NDArray[np.float64], step_
         raise DataError("no sample of the log is complete; accepted is one with rows of numbers")
     _check_force(accel)
     _check_rate(gyro, accel, step_s)
+
+
+def check_fixes(
+    time_ns: NDArray[np.int64],
+    geodetic: NDArray[np.float64],
+    velocity: NDArray[np.float64] | None,
+) -> None:
+    """Refuse fixes that are on no place of the Earth, or whose numbers betray a wrong unit.
+
+    * Latitude beyond a quarter turn, longitude beyond half a turn, height below -1 km or above
+      100 km.
+    * Over stretches of ten seconds with more than 30 m of way, ``s . d / max(|s|, |d|)^2`` below a
+      half in the median, ``s`` being the integral of the velocity and ``d`` the change of the
+      position: a velocity, a position or the time in another unit, or axes in another order.
+
+    Args:
+        time_ns: ``(T,) [ns]``.
+        geodetic: Latitude, longitude [rad], height [m], ``(T, 3)``.
+        velocity: East, north, up ``(T, 3) [m/s]``, NaN where not known; ``None`` if nowhere.
+
+    Raises:
+        DataError: With what the fixes look like.
+    """
+    if not len(time_ns):
+        raise DataError("the log has no fix; accepted is at least one")
+    ranges = ((-90, 90, "deg"), (-180, 180, "deg"), (*_HEIGHTS, "m"))
+    shown = geodetic / [DEG, DEG, 1.0]
+    names = ("latitude", "longitude", "height")
+    for name, values, (low, high, unit) in zip(names, shown.T, ranges, strict=True):
+        outside = ~((values > low - 1e-9) & (values < high + 1e-9))
+        if outside.any():
+            first = np.argmax(outside)
+            raise DataError(
+                f"the {name} of fix {first + 1} is {values[first]:.9g} {unit}; accepted is one "
+                f"from {low:.6g} to {high:.6g} {unit}"
+            )
+    if velocity is not None:
+        _check_way(time_ns, geodetic, velocity[:, :2])
+
+
+def _check_way(
+    time_ns: NDArray[np.int64], geodetic: NDArray[np.float64], velocity: NDArray[np.float64]
+) -> None:
+    known = np.isfinite(velocity).all(axis=1)
+    time, place, velocity = (time_ns[known] - time_ns[0]) / 1e9, geodetic[known], velocity[known]
+    mean = (velocity[1:] + velocity[:-1]) / 2
+    way = np.concatenate([np.zeros((1, 2)), np.cumsum(mean * np.diff(time)[:, None], axis=0)])
+    end = np.searchsorted(time, time + _STRETCH_S)
+    begin = np.flatnonzero(end < len(time))
+    begin = begin[time[end[begin]] - time[begin] < 2 * _STRETCH_S]
+    end = end[begin]
+    told = way[end] - way[begin]
+    turn = np.remainder(place[end] - place[begin] + np.pi, 2 * np.pi) - np.pi
+    moved = MEAN_RADIUS * np.stack([turn[:, 1] * np.cos(place[begin, 0]), turn[:, 0]], axis=1)
+    lengths = np.stack([np.linalg.norm(told, axis=1), np.linalg.norm(moved, axis=1)])
+    far = lengths.max(axis=0) > _FAR
+    if not far.any():
+        return
+    if np.median((np.sum(told * moved, axis=1) / lengths.max(axis=0) ** 2)[far]) < 0.5:
+        told_m, moved_m = np.median(lengths[:, far], axis=1)
+        raise DataError(
+            f"in ten seconds the positions move by {moved_m:.4g} m and the velocities by "
+            f"{told_m:.4g} m, or elsewhere; accepted are fixes that agree, so check units and axes"
+        )
 
 
 def _check_force(accel: NDArray[np.float64]) -> None:

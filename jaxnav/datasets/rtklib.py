@@ -1,4 +1,4 @@
-"""RTKLIB's solution files as plain containers.
+"""RTKLIB's solution files.
 
 Times are integer nanoseconds of GPS time since 1970-01-01 00:00:00 on the GPS calendar (no leap
 seconds), the count that RTKLIB's own time tags use. Malformed input raises `DataError`.
@@ -7,7 +7,6 @@ seconds), the count that RTKLIB's own time tags use. Malformed input raises `Dat
 import math
 import re
 from datetime import datetime, timedelta
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxnav.datasets.base import DataError, number, read_text
+from jaxnav.datasets.track import GnssTrack, without_repeats
 
 _EPOCH = datetime(1970, 1, 1)
 _GPS_EPOCH = datetime(1980, 1, 6)
@@ -31,19 +31,6 @@ _BY_COUNT = {15: _PLAIN, 24: (*_PLAIN, *_VELOCITY, *_VELOCITY_SIGMA, "sdvne", "s
 _RANGES = {"latitude(deg)": (-90, 90), "longitude(deg)": (-180, 360), "Q": (0, 9)} | dict.fromkeys(
     (*_REQUIRED[4:], *_VELOCITY_SIGMA), (0, math.inf)
 )
-
-
-class GnssTrack(NamedTuple):
-    """A GNSS solution log of T epochs, strictly increasing in time."""
-
-    time_ns: NDArray[np.int64]  # (T,) [ns] GPS time since 1970-01-01, without leap seconds
-    geodetic: NDArray[np.float64]  # (T, 3) [rad, rad, m] latitude, longitude [-pi, pi], height
-    velocity: NDArray[np.float64] | None  # (T, 3) [m/s] east, north, up
-    position_sigma: NDArray[np.float64]  # (T, 3) [m] east, north, up
-    velocity_sigma: NDArray[np.float64] | None  # (T, 3) [m/s] east, north, up
-    quality: NDArray[np.int64]  # (T,) RTKLIB's Q: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
-    source: str  # path of the file
-    duplicates: int  # epochs of the file dropped because they repeat the time before
 
 
 class _Epoch(NamedTuple):
@@ -71,13 +58,11 @@ def load_rtklib_pos(path: str | Path) -> GnssTrack:
         DataError: If the file cannot be read, is in another output format, or has a malformed
             line, a value out of range, or a time that goes backwards.
     """
-    logged = _read_epochs(Path(path))
-    repeats = [b.time_ns == a.time_ns for a, b in pairwise(logged)]
-    epochs = [epoch for epoch, repeat in zip(logged, [False, *repeats], strict=True) if not repeat]
+    epochs = _read_epochs(Path(path))
     longitude = _columns(epochs, "longitude(deg)")
     longitude = np.where(longitude > 180.0, longitude - 360.0, longitude)
     angles = np.deg2rad(np.hstack([_columns(epochs, "latitude(deg)"), longitude]))
-    return GnssTrack(
+    track = GnssTrack(
         time_ns=np.array([epoch.time_ns for epoch in epochs], dtype=np.int64),
         geodetic=np.hstack([angles, _columns(epochs, "height(m)")]),
         velocity=_optional(epochs, "ve", "vn", "vu"),
@@ -85,80 +70,9 @@ def load_rtklib_pos(path: str | Path) -> GnssTrack:
         velocity_sigma=_optional(epochs, "sdve", "sdvn", "sdvu"),
         quality=_columns(epochs, "Q")[:, 0].astype(np.int64),
         source=str(path),
-        duplicates=sum(repeats),
+        duplicates=0,
     )
-
-
-def thin(track: GnssTrack, period_s: float) -> GnssTrack:
-    """Keeps the epochs nearest a regular grid that starts at the first epoch.
-
-    A grid point with no epoch within one median interval, as in a gap, keeps none.
-
-    Args:
-        track: The log.
-        period_s: Grid period [s], at least the median interval of the log.
-
-    Returns:
-        The thinned log; `duplicates` stays that of the file.
-
-    Raises:
-        DataError: If the period is not positive and finite, or is shorter than the median interval.
-    """
-    _check_positive("thinning period [s]", period_s)
-    median = _median_interval_ns(track)
-    period = round(min(period_s, 1e9) * 1e9)  # capped at 31 years, so that it stays in int64
-    if period < median:
-        raise DataError(
-            f"{track.source}: the thinning period {period_s} s is shorter than the median "
-            f"interval; accepted is at least {median / 1e9} s"
-        )
-    if len(track.time_ns) < 2:
-        return track
-    since = track.time_ns - track.time_ns[0]
-    point = (since + period // 2) // period
-    offset = np.abs(since - point * period)
-    order = np.lexsort((offset, point))
-    nearest = order[np.unique(point[order], return_index=True)[1]]
-    # A grid point past the end of the log would keep the last epoch off the grid.
-    on_grid = (offset <= median) & (point * period <= since[-1] + median / 2)
-    return _take(track, nearest[on_grid[nearest]])
-
-
-def gaps(track: GnssTrack, factor: float = 1.5) -> NDArray[np.intp]:
-    """Finds the epochs that follow an interval longer than `factor` median intervals.
-
-    Args:
-        track: The log.
-        factor: Multiple of the median interval, positive.
-
-    Returns:
-        The indices k, (G,), where the interval from epoch k - 1 to k is that long.
-
-    Raises:
-        DataError: If the factor is not positive and finite.
-    """
-    _check_positive("gap factor", factor)
-    return np.flatnonzero(np.diff(track.time_ns) > factor * _median_interval_ns(track)) + 1
-
-
-def intervals_s(track: GnssTrack) -> NDArray[np.float64]:
-    """Returns the time since the previous epoch, (T,) [s]; 0 for the first."""
-    # The difference is taken in integers: a float64 count since 1970 resolves only 0.2 us.
-    return np.diff(track.time_ns, prepend=track.time_ns[:1]) / 1e9
-
-
-def _median_interval_ns(track: GnssTrack) -> float:
-    return float(np.median(np.diff(track.time_ns))) if len(track.time_ns) > 1 else 0.0
-
-
-def _check_positive(name: str, value: float) -> None:
-    if not 0.0 < value < math.inf:
-        raise DataError(f"the {name} is {value}; accepted is a positive finite number")
-
-
-def _take(track: GnssTrack, index: NDArray[np.intp]) -> GnssTrack:
-    arrays = {k: v[index] for k, v in track._asdict().items() if isinstance(v, np.ndarray)}
-    return track._replace(**arrays)
+    return without_repeats(track)
 
 
 def _columns(epochs: list[_Epoch], *names: str) -> NDArray[np.float64]:
