@@ -72,6 +72,9 @@ if TYPE_CHECKING:
         markov as markov,
     )
     from jaxnav.estimation.banks.weights import (
+        penalty as penalty,
+    )
+    from jaxnav.estimation.banks.weights import (
         windowed_reset as windowed_reset,
     )
     from jaxnav.estimation.bounds import (
@@ -94,6 +97,7 @@ if TYPE_CHECKING:
     from jaxnav.estimation.filters.kalman import kf as kf
     from jaxnav.estimation.filters.robust import correntropy as correntropy
     from jaxnav.estimation.filters.robust import versoria as versoria
+    from jaxnav.estimation.filters.sage_husa import sage_husa as sage_husa
     from jaxnav.estimation.filters.sigma_point import ckf as ckf
     from jaxnav.estimation.filters.sigma_point import square_root_ckf as square_root_ckf
     from jaxnav.estimation.filters.sigma_point import square_root_ukf as square_root_ukf
@@ -155,6 +159,7 @@ _HOMES = {
         "floor",
         "forget",
         "markov",
+        "penalty",
         "windowed_reset",
     ),
     "jaxnav.estimation.bounds": ("linearised_at_truth", "oracle"),
@@ -166,6 +171,7 @@ _HOMES = {
     ),
     "jaxnav.estimation.filters.kalman": ("ekf", "kf"),
     "jaxnav.estimation.filters.robust": ("correntropy", "versoria"),
+    "jaxnav.estimation.filters.sage_husa": ("sage_husa",),
     "jaxnav.estimation.filters.sigma_point": (
         "ckf",
         "square_root_ckf",

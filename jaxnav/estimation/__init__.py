@@ -12,6 +12,7 @@ def catalogue() -> dict[str, dict[str, str]]:
         iterated,
         kalman,
         robust,
+        sage_husa,
         sigma_point,
         square_root,
     )
@@ -32,6 +33,7 @@ def catalogue() -> dict[str, dict[str, str]]:
             robust.versoria,
             robust.correntropy,
             adaptive.innovation_adaptive,
+            sage_husa.sage_husa,
         ),
         "banks": (mixture.bank, mixture.mmae, mixture.immae, imm.imm, mixture.panel),
         "weight rules": tuple(weights.RULES.values()),

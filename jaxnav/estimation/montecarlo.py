@@ -78,7 +78,7 @@ def monte_carlo(
         runs: Number of runs, at least one.
         shared: Pytree that all runs see; what depends on it alone is computed once per tile.
         tile: Runs per tile and device; the default spreads the runs evenly, at most :data:`TILE`.
-        devices: Devices to use; the default is all local ones.
+        devices: Devices to use; the default is :func:`default_devices`.
         keep: Number of first runs whose ``trace`` is kept.
         compile_in_turn: Compile for one device after the other instead of for all at once: a large
             program takes more memory to compile than to run.
@@ -92,7 +92,7 @@ def monte_carlo(
     """
     if runs < 1:
         raise ValueError(f"runs is {runs}; a Monte Carlo study needs at least 1")
-    chosen = list(devices) if devices is not None else jax.local_devices()
+    chosen = list(devices) if devices is not None else default_devices()
     if tile is None:
         tile = _even_tile(runs, len(chosen))
     if tile < 1:
@@ -134,6 +134,11 @@ def monte_carlo(
     rows, finite = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *traces) if traces else ()
     return Campaign(rows, total, joined, finite)
+
+
+def default_devices() -> list[Any]:
+    """Return the devices that a study uses unless told otherwise: all local ones."""
+    return jax.local_devices()
 
 
 def _even_tile(runs: int, devices: int) -> int:

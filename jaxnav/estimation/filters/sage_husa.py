@@ -71,6 +71,7 @@ def sage_husa(
     *,
     channels: int,
     form: NoiseForm = "clamped",
+    current: bool = False,
     smooth: bool = False,
 ) -> Filter:
     """Return a filter that estimates its measurement noise, a wrapper of any other.
@@ -93,21 +94,25 @@ def sage_husa(
         model: The model.
         channels: Number of channels ``m`` of the model's observation.
         form: The sample.
+        current: Update with the noise that has seen the innovation of the step, as the paper does;
+            the default is that of the step before. The info is that of the update: with
+            ``current`` its likelihood is not that of the data given the past, which
+            tuning by likelihood needs.
         smooth: Clamp by softplus functions, for gradients.
 
     Raises:
-        ValueError: If there is no such form, or the model has noise that does not just add.
+        ValueError: If there is no such form, the residual one is asked to be ``current``, or the
+            model has noise that does not just add.
 
     References:
-        Sage and Husa (1969); Song et al. (2022), Sensors 22:5976, Eqs. (20)-(22). The paper updates
-        with the ``R`` that has seen the innovation of the step; here the update is made with that
-        of the step before, so that the info tells the likelihood of the data given the past, which
-        a bank weighs by, and ``S - R`` is ``H P H'`` of any filter. ``d_0 = 1`` of the paper, which
-        throws the start away, is ``prior_count = 0``. Eq. (22) takes ``H`` at the updated state; it
-        is that of the predicted one.
+        Sage and Husa (1969); Song et al. (2022), Sensors 22:5976, Eqs. (20)-(22).
+        ``d_0 = 1`` of the paper, which throws the start away, is ``prior_count = 0``. Eq. (22)
+        takes ``H`` at the updated state; it is that of the predicted one, by ``S - R``.
     """
     if form not in FORMS:
         raise ValueError(f"form is {form!r}; it must be one of {', '.join(FORMS)}")
+    if current and form == "residual":
+        raise ValueError("the residual form knows the noise only after the update: current is off")
     require_additive(model, "a filter that estimates measurement noise")
     base = build(with_given_noise(model))
 
@@ -125,23 +130,30 @@ def sage_husa(
     ) -> tuple[SageHusaState, Info]:
         own = SageHusa() if params.adaptation == () else params.adaptation
         nominal = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
-        L, N = cholesky(nominal).factor, mask_noise(state.noise, obs.valid)
-        R = symmetrise(matmul(matmul(L, N), L.T))
-        inner, info = base.update(given(params, 1.0, R), state.inner, u, obs)
+        L = cholesky(nominal).factor
+
+        def updated(noise: Array) -> tuple[Any, Info]:
+            R = symmetrise(matmul(matmul(L, mask_noise(noise, obs.valid)), L.T))
+            return base.update(given(params, 1.0, R), state.inner, u, obs)
+
+        inner, info = updated(state.noise)
+        N = mask_noise(state.noise, obs.valid)
         S = symmetrise(_whitened(L, _whitened(L, info.innovation_cov).T))
         if form == "residual":
             after = model.observe(params.model, base.estimate(inner).mean, u)
-            e = solve_lower(L, masked_innovation(model, obs, after))
-            sample = e[:, None] * e[None, :] + _spread_after(N, S)
+            e, spread = masked_innovation(model, obs, after), -_spread_after(N, S)
         else:
-            e = solve_lower(L, info.innovation)
-            sample = e[:, None] * e[None, :] - (S - N)
+            e, spread = info.innovation, S - N
+        e = solve_lower(L, e)
         told = obs.valid & jnp.isfinite(info.log_likelihood)
-        noise = _averaged(own, state, sample, told)
+        noise = _averaged(own, state, e[:, None] * e[None, :] - spread, told)
         if form == "clamped":
             noise = jnp.diag(_clamped(own, jnp.diag(noise), smooth))
+        if current:
+            inner, info = updated(noise)
         if form == "printed":
-            lost = ~cholesky(N).positive_definite
+            used = mask_noise(noise if current else state.noise, obs.valid)
+            lost = ~cholesky(used).positive_definite
             info = info._replace(flags=info.flags | _flag(Flag.INDEFINITE, lost))
         moved = state.log_factor
         if own.process != ():

@@ -51,7 +51,8 @@ class SageHusaConfig:
         p0_position: Standard deviation of the position at the start [m].
         forgetting: Forgetting factors of the bank.
         single_forgetting: The one of the single Sage-Husa filter, one of them.
-        q_scales: Factors on Q of the bank, 1 among them.
+        q_scales: Factors on the accelerometers' part of Q of the bank, 1 among them: the part that
+            the paper gives no number for.
         r_scales: Factors on the horizontal position's R of the MMAE, 1 among them.
         prior_count: Samples that the filters' R counts for at the start.
         clamp: Smallest and largest R over the filters' R at the start.

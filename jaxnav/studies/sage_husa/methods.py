@@ -15,7 +15,7 @@ from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.montecarlo import RunOutput
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, WeightRule, replicate
-from jaxnav.navigation.earth import offset_between
+from jaxnav.navigation.earth import displaced, offset_between
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import CHANNELS, sins_gnss
 from jaxnav.studies.level_sins import Clock
@@ -194,7 +194,6 @@ def _params_of(config: SageHusaConfig, member: _Member) -> DriveParams:
     grown = jnp.sqrt(member.r_scale)
     position = grown if wrong else 1 + (grown - 1) * horizontal
     own = noise._replace(
-        gyro_noise=noise.gyro_noise * jnp.sqrt(member.q_scale),
         accel_noise=noise.accel_noise * jnp.sqrt(member.q_scale),
         position_noise=noise.position_noise * position,
         velocity_noise=noise.velocity_noise * (grown if wrong else 1.0),
@@ -211,11 +210,16 @@ def _stacked(trees: list[Any]) -> Any:
 
 
 @cache
+def member_of() -> Filter:
+    """Return the filter that all members are."""
+    return sage_husa(ukf, informed(sins_gnss()), channels=len(CHANNELS), current=True)
+
+
+@cache
 def filter_of(methods: tuple[str, ...]) -> Filter:
     """Return the panel of all methods."""
-    member = sage_husa(ukf, informed(sins_gnss()), channels=len(CHANNELS))
     bayesian = {"mmae": bayes()} | BANKS
-    return panel(member, {name: bayesian.get(name, fixed()) for name in methods})
+    return panel(member_of(), {name: bayesian.get(name, fixed()) for name in methods})
 
 
 @cache
@@ -229,10 +233,8 @@ def run_one(setup: Setup) -> Any:
 
         def record(state: PanelState, info: Any) -> Any:
             del info
-            found = filter.estimate(state)
-            each = [found[name] for name in setup.methods]
-            position = jnp.stack([own.mean.position for own in each])
-            cov = jnp.stack([own.cov[HORIZONTAL, HORIZONTAL] for own in each])
+            logs = jnp.stack([state.log_weights[name] for name in setup.methods])
+            position, cov = horizontal(logs, jax.vmap(member_of().estimate)(state.members))
             weights = jnp.stack([jnp.exp(state.log_weights[name]) for name in BANKS])
             variance = jnp.diagonal(state.members.noise, axis1=1, axis2=2)[: setup.size, 3:5]
             return position, cov, weights[:, : setup.size], variance
@@ -241,6 +243,31 @@ def run_one(setup: Setup) -> Any:
         return judge(now, found, shared, setup)
 
     return run_methods
+
+
+def horizontal(log_weights: Array, members: Gaussian) -> Gaussian:
+    """Return horizontal positions of mixtures, all from the first member's.
+
+    What the panel's estimate says of them, at a tenth of its cost: that matches the moments of all
+    15 states, method by method.
+
+    Args:
+        log_weights: ``(methods, M)``.
+        members: The members' estimates, leading axis ``M``; errors in position are additive.
+
+    Returns:
+        ``(methods, 3)`` geodetic positions, and ``(methods, 2, 2) [m^2]``.
+    """
+    first = members.mean.position[0]
+    offset = jax.vmap(offset_between, in_axes=(None, 0))(first, members.mean.position)
+    cov = members.cov[:, HORIZONTAL, HORIZONTAL]
+    second = cov + offset[:, :2, None] * offset[:, None, :2]
+    w = jnp.exp(log_weights)
+    count = w.shape[1]
+    mean = w @ offset
+    spread = (w @ second.reshape(count, 4)).reshape(-1, 2, 2)
+    cov = spread - mean[:, :2, None] * mean[:, None, :2]
+    return Gaussian(jax.vmap(displaced, in_axes=(None, 0))(first, mean), cov)
 
 
 def params_of(start: Gaussian, shared: Shared) -> BankParams:
