@@ -1,4 +1,4 @@
-"""Command line: ``jaxnav list | run | allan | doctor``.
+"""Command line: ``jaxnav list | run | filter | allan | doctor``.
 
 Imports of JAX and the studies wait until a command needs them, so that help is immediate.
 """
@@ -24,6 +24,7 @@ A differentiable filter bank for aided inertial navigation.
 commands:
   list          studies with their scenarios, filters, weight rules
   run STUDY     run a study; `jaxnav run STUDY --help` lists its parameters
+  filter LOG    a recorded drive through a filter or a bank; `jaxnav filter --help` lists options
   allan LOG     noise coefficients of an inertial sensor from a log at rest
   doctor        versions, devices, 64-bit floats, compilation cache
 
@@ -61,6 +62,7 @@ def _dispatch(arguments: list[str]) -> int:
     commands: dict[str, Callable[[list[str]], int]] = {
         "list": _list,
         "run": _run,
+        "filter": _filter,
         "allan": _allan,
         "doctor": _doctor,
     }
@@ -136,16 +138,62 @@ def _run(rest: list[str]) -> int:
     return DIVERGED if any(result.diverged for result in results) else OK
 
 
-def _allan(rest: list[str]) -> int:
+def _options_after_log(command: str, rest: list[str]) -> list[str] | None:
+    """Return the arguments after the log, or those that ask for help; ``None`` if there are none.
+
+    Raises:
+        ConfigError: If an option stands where the log should.
+    """
     if not rest:
-        print("usage: jaxnav allan LOG [options]; `jaxnav allan --help` lists them")
-        return BAD_INPUT
+        print(f"usage: jaxnav {command} LOG [options]; `jaxnav {command} --help` lists them")
+        return None
     asked = rest[0] in ("-h", "--help")
     if rest[0].startswith("-") and not asked:
         raise ConfigError(f"the log is not given; it must come before the options, not {rest[0]!r}")
+    return rest if asked else rest[1:]
+
+
+def _filter(rest: list[str]) -> int:
+    options = _options_after_log("filter", rest)
+    if options is None:
+        return BAD_INPUT
+    from jaxnav.options import parse_filter
+
+    parsed = parse_filter(options)
+    if parsed is None:
+        return OK
+    configure_jax()
+    from jaxnav.datasets.formats import load_drive
+    from jaxnav.recorded.analysis import analyse
+    from jaxnav.recorded.config import check
+    from jaxnav.recorded.figures import draw
+    from jaxnav.recorded.outputs import write_trajectory
+    from jaxnav.report import Progress, print_document, print_filter
+    from jaxnav.results import claim_directory, finite_or_null, write_document
+
+    require_x64()
+    check(parsed.config)
+    log = load_drive(Path(rest[0]))
+    directory = claim_directory(parsed.out)
+    with Progress(quiet=parsed.json, unit="parts") as progress:
+        report = analyse(log, parsed.config, progress)
+    write_trajectory(report.drive, report.kept, report.members, log.source, directory)
+    figures = draw(report, log, directory)
+    write_document(report.document, directory / "summary.json")
+    if parsed.json:
+        print_document(finite_or_null(report.document))
+    else:
+        print_filter(report.document, directory, figures)
+    return DIVERGED if report.document["diverged"] else OK
+
+
+def _allan(rest: list[str]) -> int:
+    options = _options_after_log("allan", rest)
+    if options is None:
+        return BAD_INPUT
     from jaxnav.options import parse_allan
 
-    parsed = parse_allan(rest if asked else rest[1:])
+    parsed = parse_allan(options)
     if parsed is None:
         return OK
     configure_jax()

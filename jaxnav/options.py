@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import tyro
 
 from jaxnav.noise_report.config import AllanConfig
+from jaxnav.recorded.config import FilterConfig, from_toml
 from jaxnav.studies.base import ConfigError
 
 
@@ -45,14 +46,43 @@ def parse_allan(arguments: list[str]) -> Options | None:
     return _parse("jaxnav allan LOG", AllanConfig, Path("results") / "allan", files, arguments)
 
 
+def parse_filter(arguments: list[str]) -> Options | None:
+    """Parse the options of ``jaxnav filter LOG``, those after the log; as :func:`parse_run`.
+
+    The values of the file behind ``--config`` stand where no flag is given.
+    """
+    files = "summary.json, trajectory.csv, .npz and .kml, and the figures"
+    path = _value_of("--config", arguments)
+    default = FilterConfig() if path is None else from_toml(Path(path))
+    program, out = "jaxnav filter LOG", Path("results") / "filter"
+    return _parse(program, FilterConfig, out, files, arguments, default)
+
+
+def _value_of(flag: str, arguments: list[str]) -> str | None:
+    """Return the last value of a flag, as ``--flag value`` or ``--flag=value``."""
+    found = None
+    for i, argument in enumerate(arguments):
+        if argument == flag and i + 1 < len(arguments):
+            found = arguments[i + 1]
+        elif argument.startswith(f"{flag}="):
+            found = argument.removeprefix(f"{flag}=")
+    return found
+
+
 def _parse(
-    program: str, config: type, out: Path, files: str, arguments: list[str]
+    program: str,
+    config: type,
+    out: Path,
+    files: str,
+    arguments: list[str],
+    default: Any = None,
 ) -> Options | None:
     """Parse the fields of a configuration, ``--out`` and ``--json``."""
+    given = config() if default is None else default
     options = make_dataclass(
         "Options",
         [
-            ("config", tyro.conf.OmitArgPrefixes[config], field(default_factory=config)),
+            ("config", tyro.conf.OmitArgPrefixes[config], field(default=given)),
             ("out", Path, field(default=out)),
             ("json", bool, field(default=False)),
         ],

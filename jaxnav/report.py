@@ -21,14 +21,14 @@ NOT_SHOWN = ("anees_dof", "log_likelihood_se")
 class Progress:
     """Progress of the scenarios with the time left, on standard error."""
 
-    def __init__(self, *, quiet: bool = False) -> None:
-        """Make the display; ``quiet`` shows nothing."""
+    def __init__(self, *, quiet: bool = False, unit: str = "runs") -> None:
+        """Make the display; ``quiet`` shows nothing, and ``unit`` is what is counted."""
         self._tasks: dict[str, rich.progress.TaskID] = {}
         self._display = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
             rich.progress.BarColumn(),
             rich.progress.MofNCompleteColumn(),
-            rich.progress.TextColumn("runs, left"),
+            rich.progress.TextColumn(f"{unit}, left"),
             rich.progress.TimeRemainingColumn(),
             console=Console(stderr=True),
             transient=True,
@@ -106,27 +106,27 @@ def _method_table(result: StudyResult) -> Table:
         table.add_column(name.replace("_", " "), justify="right")
     for method, measures in result.methods.items():
         shown = _shown(measures)
-        errors = [_with_error(shown.get(name)) for name in columns]
+        errors = [shown.get(name, "") for name in columns]
         table.add_row(method, *errors, *(_number(measures.get(name)) for name in scalars))
     return table
 
 
-def _shown(measures: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the errors of a method by the heading of their column."""
+def _shown(measures: dict[str, Any]) -> dict[str, str]:
+    """Return the errors of a method by the heading of their column; squared ones by interval."""
     errors = {
-        f"RMSE {name} [{measure['unit']}]": measure
+        f"RMSE {name} [{measure['unit']}]": _with_error(measure)
         for name, measure in measures.get("rmse", {}).items()
         if "of" not in measure
     }
-    for axis, spans in measures.get("mse", {}).items():
-        for span, measure in spans.items():
-            errors[f"MSE {axis} [{measure['unit']}] {span} s"] = measure
+    axes = measures.get("mse", {})
+    for span in next(iter(axes.values()), {}):
+        values = [axes[axis][span] for axis in axes]
+        heading = f"MSE {', '.join(axes)} [{values[0]['unit']}] {span} s"
+        errors[heading] = ", ".join(f"{measure['value']:.2f}" for measure in values)
     return errors
 
 
-def _with_error(measure: dict[str, Any] | None) -> str:
-    if measure is None:
-        return ""
+def _with_error(measure: dict[str, Any]) -> str:
     value, se = measure["value"], measure.get("se")
     if se is None or se != se:
         return f"{value:.4f}"
@@ -196,6 +196,76 @@ def _coefficient(entry: dict[str, Any]) -> str:
     return f"below {entry['high']:.3g}" if entry["high"] < float("inf") else "not known"
 
 
+def print_filter(document: dict[str, Any], directory: Path, figures: list[Path]) -> None:
+    """Print what became of a recorded drive: counts, consistency, and the scores it allows."""
+    console = Console()
+    counts, run, start = document["counts"], document["filter"], document["alignment"]
+    console.print(
+        f"{counts['samples']} samples at {1 / counts['sample_s']:.4g} Hz "
+        f"({counts['skipped_rows']} rows skipped, {counts['nan_rows']} with an entry that is no "
+        f"number, {counts['gaps']} gaps); {counts['fixes_used']} of {counts['fixes']} fixes used; "
+        f"aligned {'at rest' if start['kind'] == 'rest' else 'on the move'} until "
+        f"{start['end_s']:.4g} s; fixes moved by {document['time_offset']['used_s']:.4g} s",
+        soft_wrap=True,
+    )
+    within = run["nis_within"]
+    console.print(
+        f"log-likelihood {run['log_likelihood']:.1f}; NIS per channel "
+        f"{run['nis_per_channel']:.3g}, {within['share']:.1%} of fixes within the "
+        f"{within['confidence']:.0%} bound",
+        soft_wrap=True,
+    )
+    if document["reference"]:
+        console.print(_reference_table(document["reference"]))
+    if document["outages"]:
+        console.print(_outage_table(document["outages"]))
+    if document["added_noise"]:
+        console.print(_added_noise_table(document["added_noise"]))
+    for note in document["notes"]:
+        console.print(f"[yellow]{escape(note)}", soft_wrap=True)
+    if document["diverged"]:
+        console.print("[red]the filter diverged")
+    files = "summary.json, trajectory.csv, trajectory.npz, trajectory.kml, "
+    names = files + ", ".join(path.name for path in figures)
+    console.print(f"Written to {directory}: {names}", soft_wrap=True)
+
+
+def _reference_table(scores: dict[str, Any]) -> Table:
+    table = Table(title="RMS errors against the reference, after the first 20 s")
+    for heading in ("", "horizontal [m]", "up [m]", "roll [deg]", "pitch [deg]", "heading [deg]"):
+        table.add_column(escape(heading), justify="right" if heading else "left")
+    names = ("horizontal_rms_m", "up_rms_m", "roll_rms_deg", "pitch_rms_deg", "heading_rms_deg")
+    table.add_row("filter", *(_number(scores[name]) for name in names))
+    table.add_row("receiver", *(_number(scores[f"receiver_{name}"]) for name in names[:2]))
+    return table
+
+
+def _outage_table(scores: dict[str, Any]) -> Table:
+    table = Table(title=f"horizontal error after {scores['length_s']:g} s without fixes")
+    for heading in ("", "windows", "median [m]", "largest [m]"):
+        table.add_column(escape(heading), justify="right" if heading else "left")
+    names = {"inertial": "inertial sensors alone", "constrained": "with constraints"}
+    for name, entry in scores["horizontal_m"].items():
+        count = str(len(entry["all"]))
+        table.add_row(names[name], count, f"{entry['median']:.2f}", f"{entry['max']:.2f}")
+    return table
+
+
+def _added_noise_table(scores: dict[str, Any]) -> Table:
+    table = Table(show_lines=True, title=f"noise added to the fixes, {scores['runs']} draws")
+    table.add_column("method")
+    for span in scores["spans"]:
+        where = f"{span['sigma_m']:g} m, {span['start_s']:g} s to {span['end_s']:g} s"
+        table.add_column(f"MSE east, north \\[m^2]\n{where}", justify="right")
+    for name, entries in scores["methods"].items():
+        cells = [
+            f"{_with_error(entry['mse_east'])}\n{_with_error(entry['mse_north'])}"
+            for entry in entries
+        ]
+        table.add_row(name, *cells)
+    return table
+
+
 def print_catalogue() -> None:
     """Print the studies, filters, weight rules and data formats."""
     from jaxnav.estimation import catalogue
@@ -218,7 +288,9 @@ def print_catalogue() -> None:
             listing.add_row(name, escape(text))
         console.print(listing)
     console.print(
-        "data formats: RTKLIB .pos (run gnss-track --log PATH), inertial CSV (allan PATH)"
+        "data formats: RTKLIB .pos (run gnss-track --log PATH), inertial CSV (allan PATH), drives "
+        "as RTK folders, comma2k19 segments and CSV (filter PATH)",
+        soft_wrap=True,
     )
 
 

@@ -55,6 +55,8 @@ def finite_or_null(value: Any) -> Any:
         return {str(key): finite_or_null(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [finite_or_null(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return finite_or_null(value.tolist())
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -94,7 +96,11 @@ def write(result: StudyResult, directory: Path) -> Path:
 
 def write_document(document: dict[str, Any], path: Path) -> Path:
     """Write a document as JSON; the file is complete or not there. Return its path."""
-    text = json.dumps(finite_or_null(document), indent=2, allow_nan=False) + "\n"
+    return write_text(json.dumps(finite_or_null(document), indent=2, allow_nan=False) + "\n", path)
+
+
+def write_text(text: str, path: Path) -> Path:
+    """Write a text in UTF-8; the file is complete or not there. Return its path."""
     return _replace(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 
 

@@ -85,9 +85,11 @@ def sage_husa(
     * "residual": ``e e' + H P+ H'`` with the residual ``e = z - h(x+)`` after the update; a sum of
       squares, so that ``R`` stays positive definite.
 
-    Channels that did not arrive keep their noise. A channel that arrives alone is averaged at its
-    own pace, by ``R <- a R a + s sample s`` with ``a = diag(sqrt(1 - d))``, ``s = diag(sqrt(d))``,
-    which keeps ``R`` positive definite too.
+    Channels that did not arrive keep their noise, and so do all if the update fails. A channel that
+    arrives alone is averaged at its own pace, by ``R <- a R a + s sample s`` with
+    ``a = diag(sqrt(1 - d))``, ``s = diag(sqrt(d))``, which keeps ``R`` positive definite too; ``L``
+    is that of the channels that arrived. A model's ``R`` that has no such factor is used as it is
+    and nothing is learnt in the step.
 
     Args:
         build: The filter to make adaptive; any of this library that takes a model.
@@ -130,10 +132,12 @@ def sage_husa(
     ) -> tuple[SageHusaState, Info]:
         own = SageHusa() if params.adaptation == () else params.adaptation
         nominal = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
-        L = cholesky(nominal).factor
+        root = cholesky(nominal)
+        L, scalable = root.factor, root.positive_definite
 
         def updated(noise: Array) -> tuple[Any, Info]:
-            R = symmetrise(matmul(matmul(L, mask_noise(noise, obs.valid)), L.T))
+            scaled = symmetrise(matmul(matmul(L, mask_noise(noise, obs.valid)), L.T))
+            R = jnp.where(scalable, scaled, nominal)
             return base.update(given(params, 1.0, R), state.inner, u, obs)
 
         inner, info = updated(state.noise)
@@ -145,10 +149,12 @@ def sage_husa(
         else:
             e, spread = info.innovation, S - N
         e = solve_lower(L, e)
-        told = obs.valid & jnp.isfinite(info.log_likelihood)
+        told = obs.valid & scalable & jnp.isfinite(info.log_likelihood)
         noise = _averaged(own, state, e[:, None] * e[None, :] - spread, told)
         if form == "clamped":
-            noise = jnp.diag(_clamped(own, jnp.diag(noise), smooth))
+            # Applied to what did not arrive too, the smooth clamp would move it step by step.
+            variance = jnp.diag(noise)
+            noise = jnp.diag(jnp.where(told, _clamped(own, variance, smooth), variance))
         if current:
             inner, info = updated(noise)
         if form == "printed":
@@ -180,7 +186,10 @@ def averaging(forgetting: Array | float, count: Array) -> Array:
     b = jnp.asarray(forgetting, count.dtype)
     fades = b < 1
     rate = jnp.log(jnp.where(fades, b, 0.5))
-    faded = jnp.expm1(rate) / jnp.expm1((count + 1) * rate)
+    # At an infinite count the derivative of the power would be zero times infinity.
+    endless = jnp.isinf(count)
+    worn = jnp.where(endless, -1, jnp.expm1((jnp.where(endless, 0, count) + 1) * rate))
+    faded = jnp.expm1(rate) / worn
     return jnp.where(fades, faded, 1 / (count + 1))
 
 

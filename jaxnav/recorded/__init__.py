@@ -1,0 +1,1 @@
+"""`jaxnav filter`: a recorded drive through any filter or bank, and its scores."""

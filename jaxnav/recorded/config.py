@@ -1,0 +1,221 @@
+"""What `jaxnav filter` may be told, by flags or by a TOML file with the same names, free of JAX."""
+
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from jaxnav.studies.base import (
+    ConfigError,
+    require,
+    require_choice,
+    require_finite,
+    require_positive,
+)
+
+FilterName = Literal["ekf", "ukf", "liekf", "se23-ekf", "versoria-ekf", "sage-husa-ekf", "iae"]
+RuleName = Literal["floor", "bayes", "fixed", "forget", "markov", "penalty"]
+When = Literal["auto", "on", "off"]
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """A recorded drive through a filter, or a bank of them.
+
+    The members of a bank are the product of r_factors, q_factors and forgetting. The noise
+    of the inertial sensors is far above a data sheet's: a car shakes them, and what their scale,
+    axes and clock are off by acts like noise on the move. The defaults are near the likeliest on
+    the recorded drive with RTK, whose sensors at rest have 0.0038 deg/s and 70 ug.
+
+    Attributes:
+        config: TOML file with these names; flags go before it.
+        filter: The filter, or the members of the bank.
+        r_factors: Factors on the variances of the receiver, a member each.
+        q_factors: Factors on the process noise, a member each.
+        forgetting: Forgetting factors of sage-husa-ekf, a member each.
+        rule: How a bank weighs its members; floor is Bayes' rule with a floor, and forget and
+            markov are before Bayes' rule too.
+        weight_floor: Least weight of a member under floor.
+        rule_time_s: Time in which evidence fades by e under forget, or between switches (markov).
+        gyro_noise_dps: Noise density of the gyros [deg/s/sqrt(Hz)].
+        accel_noise_ug: Noise density of the accelerometers [ug/sqrt(Hz)].
+        gyro_walk_dps: Random walk of the gyro drift [deg/s/sqrt(s)].
+        accel_walk_ug: Random walk of the accelerometer bias [ug/sqrt(s)].
+        position_sigma_m: Least standard deviation of a fix, an axis; larger ones of the log count.
+        velocity_sigma: Least standard deviation of a velocity [m/s], an axis; likewise.
+        time_offset_s: Added to the times of the fixes: the clock of the receiver against that of
+            the inertial sensors.
+        tune_offset: Whether to look for the likeliest offset, from there, and to use it.
+        rate_hz: Rate of the filter; by default that of the inertial samples.
+        constraints: Whether to observe that the vehicle does not move sideways or upwards, and
+            rests at detected stops.
+        steered_sigma: Standard deviation of the lateral and vertical velocity [m/s].
+        steered_rate_hz: How often they are observed: errors of a car last longer than a sample.
+        rest_sigma: Standard deviation of the velocity at a stop [m/s].
+        rest_speed: Speed by the filter at which a stop is doubted: a smooth road feels like one
+            [m/s].
+        axle_m: From the inertial sensors to the middle of the rear axle: forward, left, up [m].
+        mounting_deg: Rotation vector from the sensors' axes to the vehicle's [deg]; by default from
+            the direction of motion in the first minute, by a run without the constraints.
+        stop_gyro_dps: Angular rate that a stopped vehicle stays below [deg/s].
+        stop_accel: Standard deviation of the specific force that it stays below [m/s^2].
+        stop_time_s: For so long; both of means over 0.2 s.
+        align_speed: Speed at which the course gives the heading, and the filter starts [m/s].
+        outages: Whether to hide the fixes in windows and score against them; auto does if most
+            fixes are RTK-fixed.
+        outage_s: Length of a window.
+        outage_every_s: From the start of a window to that of the next.
+        added_noise: Whether to compare filters and banks on fixes with noise added.
+        noise_start_s: Where the spans of added noise start, seconds since the first sample.
+        noise_end_s: Where they end.
+        noise_sigma_m: Standard deviation of the noise east and north in each span.
+        noise_runs: Draws of the noise.
+        noise_rate_hz: Rate of the filters in that comparison, and in the search for the offset.
+        seed: Seed of the draws.
+    """
+
+    config: Path | None = None
+    filter: FilterName = "ekf"
+    r_factors: tuple[float, ...] = (1.0,)
+    q_factors: tuple[float, ...] = (1.0,)
+    forgetting: tuple[float, ...] = (0.97,)
+    rule: RuleName = "floor"
+    weight_floor: float = 1e-3
+    rule_time_s: float = 10.0
+    gyro_noise_dps: float = 0.1
+    accel_noise_ug: float = 2000.0
+    gyro_walk_dps: float = 0.002
+    accel_walk_ug: float = 100.0
+    position_sigma_m: float = 0.03
+    velocity_sigma: float = 0.08
+    time_offset_s: float = 0.0
+    tune_offset: bool = False
+    rate_hz: float | None = None
+    constraints: bool = True
+    steered_sigma: float = 0.25
+    steered_rate_hz: float = 10.0
+    rest_sigma: float = 0.05
+    rest_speed: float = 1.0
+    axle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mounting_deg: tuple[float, float, float] | None = None
+    stop_gyro_dps: float = 0.8
+    stop_accel: float = 0.06
+    stop_time_s: float = 2.0
+    align_speed: float = 3.0
+    outages: When = "auto"
+    outage_s: float = 15.0
+    outage_every_s: float = 35.0
+    added_noise: bool = False
+    noise_start_s: tuple[float, ...] = (120.0, 320.0)
+    noise_end_s: tuple[float, ...] = (220.0, 420.0)
+    noise_sigma_m: tuple[float, ...] = (6.0, 9.0)
+    noise_runs: int = 10
+    noise_rate_hz: float = 10.0
+    seed: int = 0
+
+
+def check(config: FilterConfig) -> None:
+    """Raise :class:`~jaxnav.studies.base.ConfigError` if a parameter is out of its range."""
+    require_finite(config)
+    require_choice(config, "filter", "rule", "outages")
+    require_positive(
+        config,
+        *("r_factors", "q_factors", "forgetting", "rule_time_s"),
+        *("gyro_noise_dps", "accel_noise_ug", "gyro_walk_dps", "accel_walk_ug"),
+        *("position_sigma_m", "velocity_sigma", "steered_sigma", "steered_rate_hz", "rest_sigma"),
+        "rest_speed",
+        *("stop_gyro_dps", "stop_accel", "stop_time_s", "align_speed", "outage_s"),
+        *("noise_sigma_m", "noise_rate_hz"),
+    )
+    good = all(b <= 1 for b in config.forgetting)
+    require(good, "forgetting", config.forgetting, "in (0, 1]")
+    require(
+        len(config.forgetting) == 1 or config.filter == "sage-husa-ekf",
+        "forgetting",
+        config.forgetting,
+        f"one factor for {config.filter}; several make a bank of sage-husa-ekf",
+    )
+    count = members(config)
+    accepted = f"positive and below the equal weight of the {count} members"
+    require(0 < config.weight_floor < 1 / count, "weight_floor", config.weight_floor, accepted)
+    if config.rate_hz is not None:
+        require(config.rate_hz > 0, "rate_hz", config.rate_hz, "positive")
+    require(
+        config.outage_every_s > config.outage_s,
+        "outage_every_s",
+        config.outage_every_s,
+        f"above outage_s, which is {config.outage_s}",
+    )
+    _check_spans(config)
+    require(config.noise_runs >= 1, "noise_runs", config.noise_runs, "at least 1")
+    require(0 <= config.seed < 2**63, "seed", config.seed, "between 0 and 2**63 - 1")
+
+
+def members(config: FilterConfig) -> int:
+    """Return how many filters run: one, or the members of the bank."""
+    return len(config.r_factors) * len(config.q_factors) * len(config.forgetting)
+
+
+def _check_spans(config: FilterConfig) -> None:
+    count = len(config.noise_sigma_m)
+    for name in ("noise_start_s", "noise_end_s"):
+        value = getattr(config, name)
+        require(len(value) == count, name, value, f"{count} numbers, as in noise_sigma_m")
+    ordered = zip(config.noise_start_s, config.noise_end_s, strict=True)
+    require(
+        all(0 <= start < end for start, end in ordered),
+        "noise_end_s",
+        config.noise_end_s,
+        f"after noise_start_s, which is {config.noise_start_s} and not negative",
+    )
+
+
+def from_toml(path: Path) -> FilterConfig:
+    """Return the configuration of a TOML file: names of :class:`FilterConfig` with their values.
+
+    Raises:
+        ConfigError: If the file cannot be read, or has a name or a type that is not accepted.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise ConfigError(f"{path}: {reason}; it must be a readable TOML file") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        said = str(error).splitlines()[0]
+        raise ConfigError(f"{path} is not TOML: {said}; it must be a TOML file") from None
+    kinds = get_type_hints(FilterConfig)
+    names = [field.name for field in fields(FilterConfig) if field.name != "config"]
+    given: dict[str, Any] = {"config": path}
+    for name, value in document.items():
+        if name not in names:
+            raise ConfigError(f"{path}: there is no {name!r}; it must be one of {', '.join(names)}")
+        given[name] = _typed(f"{path}: {name}", kinds[name], value)
+    return FilterConfig(**given)
+
+
+def _typed(name: str, kind: Any, value: Any) -> Any:
+    """Return a value of a TOML file as the field's type."""
+    if NoneType in get_args(kind):
+        kind = get_args(kind)[0]
+    if get_origin(kind) is Literal:
+        require(value in get_args(kind), name, repr(value), "one of " + ", ".join(get_args(kind)))
+        return value
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        length = None if parts[1] is Ellipsis else len(parts)
+        accepted = "a list of numbers" if length is None else f"a list of {length} numbers"
+        good = isinstance(value, list) and all(_is_number(entry) for entry in value)
+        require(good and length in (None, len(value)), name, repr(value), accepted)
+        return tuple(float(entry) for entry in value)
+    if kind is float:
+        require(_is_number(value), name, repr(value), "a number")
+        return float(value)
+    accepted = {bool: "true or false", int: "a whole number"}[kind]
+    require(type(value) is kind, name, repr(value), accepted)
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

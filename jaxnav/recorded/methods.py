@@ -1,0 +1,268 @@
+"""The filters and banks that may be asked for, and what a run of one keeps."""
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxnav.estimation.banks.mixture import BankParams, bank
+from jaxnav.estimation.banks.weights import (
+    Penalty,
+    bayes,
+    chain,
+    fixed,
+    floor,
+    forget,
+    markov,
+    penalty,
+)
+from jaxnav.estimation.filters.adaptive import innovation_adaptive
+from jaxnav.estimation.filters.kalman import ekf
+from jaxnav.estimation.filters.robust import versoria
+from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
+from jaxnav.estimation.filters.sigma_point import ukf
+from jaxnav.estimation.run import Recorder
+from jaxnav.estimation.types import (
+    Filter,
+    FilterParams,
+    Gaussian,
+    Info,
+    Model,
+    WeightRule,
+    replicate,
+)
+from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
+from jaxnav.navigation.models.sins_gnss import SinsGnssParams
+from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
+from jaxnav.recorded.config import FilterConfig, members
+from jaxnav.recorded.preparation import CHANNELS, Drive
+from jaxnav.units import DEG, GRAVITY
+
+ERRORS: dict[str, LevelError] = {"liekf": "left-invariant", "se23-ekf": "right-invariant"}
+NOISE_RANGE = (0.1, 1e6)
+"""Variance over the nominal that a Sage-Husa filter may estimate: RTK to hundreds of metres."""
+
+
+class Method(NamedTuple):
+    """A filter or bank with its model.
+
+    Attributes:
+        filter: What runs.
+        model: The model of a member.
+        form: The definition of its error.
+        record: What a run keeps of a step: a :class:`Kept`.
+        banked: Whether it is a bank.
+    """
+
+    filter: Filter
+    model: Model
+    form: ErrorForm
+    record: Recorder
+    banked: bool
+
+
+class Kept(NamedTuple):
+    """What is kept of each step.
+
+    Attributes:
+        mean: The state.
+        sigma: ``(15,)`` standard deviations in additive errors.
+        nis: Normalised innovation squared.
+        log_likelihood: Of the step.
+        innovation: ``(6,)`` of the receiver's channels.
+        innovation_sigma: ``(6,)`` what the filter expects.
+        weights: ``(M,)`` of the members of a bank; ``(0,)`` of a filter.
+    """
+
+    mean: SinsLevel
+    sigma: Array
+    nis: Array
+    log_likelihood: Array
+    innovation: Array
+    innovation_sigma: Array
+    weights: Array
+
+
+def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> Method:
+    """Return the filter or bank of a configuration.
+
+    Args:
+        config: The configuration.
+        origin: Position about which the right-invariant error turns.
+        constrained: Whether the model has the channels of the constraints.
+    """
+    error = ERRORS.get(config.filter, "additive")
+    model = vehicle(error, origin, constrained=constrained)
+    channels = CHANNELS if constrained else FIXES.stop
+    one, form = member(config, model, channels), error_form(error, origin)
+    banked = members(config) > 1
+    chosen = bank(one, rule(config)) if banked else one
+
+    def record(state: Any, info: Info) -> Kept:
+        estimate = chosen.estimate(state)
+        weights = jnp.exp(state.log_weights) if banked else jnp.zeros(0)
+        seen = jnp.diag(info.innovation_cov)[FIXES]
+        return Kept(
+            estimate.mean,
+            additive_sigma(form, estimate),
+            info.nis,
+            info.log_likelihood,
+            info.innovation[FIXES],
+            jnp.sqrt(seen),
+            weights,
+        )
+
+    return Method(chosen, model, form, record, banked)
+
+
+def member(config: FilterConfig, model: Model, channels: int) -> Filter:
+    """Return the single filter of a configuration."""
+    builders: dict[str, Callable[[], Filter]] = {
+        "ukf": lambda: ukf(model),
+        "versoria-ekf": lambda: versoria(ekf, model),
+        "sage-husa-ekf": lambda: sage_husa(ekf, model, channels=channels),
+        "iae": lambda: innovation_adaptive(ekf, model),
+    }
+    return builders.get(config.filter, lambda: ekf(model))()
+
+
+def rule(config: FilterConfig) -> WeightRule:
+    """Return the weight rule of a configuration."""
+    rules = {
+        "floor": lambda: chain(bayes(), floor()),
+        "bayes": bayes,
+        "fixed": fixed,
+        "forget": lambda: chain(forget(), bayes()),
+        "markov": lambda: chain(markov(), bayes()),
+        "penalty": penalty,
+    }
+    return rules[config.rule]()
+
+
+def rule_params(config: FilterConfig, period: float) -> Any:
+    """Return the rule's parameters for a filter of a given period [s]."""
+    share = jnp.array(period / config.rule_time_s)
+    given = {
+        "floor": ((), jnp.array(config.weight_floor)),
+        "forget": (jnp.exp(-share), ()),
+        "markov": (-jnp.expm1(-share), ()),
+        "penalty": Penalty(),
+    }
+    return given.get(config.rule, ())
+
+
+def model_params(
+    config: FilterConfig, drive: Drive, lever_arm: np.ndarray, mounting: np.ndarray
+) -> VehicleParams:
+    """Return the parameters of the model, noise densities as the configuration has them."""
+
+    def axes(value: float) -> Array:
+        return jnp.full(3, value)
+
+    micro_g = 1e-6 * GRAVITY
+    return VehicleParams(
+        SinsGnssParams(
+            gyro_noise=axes(config.gyro_noise_dps * DEG),
+            accel_noise=axes(config.accel_noise_ug * micro_g),
+            gyro_walk=axes(config.gyro_walk_dps * DEG),
+            accel_walk=axes(config.accel_walk_ug * micro_g),
+            velocity_noise=jnp.asarray(drive.velocity_noise),
+            position_noise=jnp.asarray(drive.position_noise),
+            lever_arm=jnp.asarray(lever_arm),
+        ),
+        time_offset=jnp.array(0.0),
+        mounting=jnp.asarray(mounting),
+        axle=jnp.array(config.axle_m),
+        steered_noise=jnp.full(2, config.steered_sigma),
+        rest_noise=jnp.array(config.rest_sigma),
+        rest_speed=jnp.array(config.rest_speed),
+    )
+
+
+def filter_params(
+    config: FilterConfig,
+    drive: Drive,
+    lever_arm: np.ndarray,
+    form: ErrorForm,
+    mounting: np.ndarray | None = None,
+) -> FilterParams | BankParams:
+    """Return the parameters of the filter or bank of a configuration.
+
+    Args:
+        config: The configuration.
+        drive: The drive.
+        lever_arm: From the inertial sensors to the antenna ``(3,) [m]``.
+        form: The definition of the error.
+        mounting: Rotation vector to the vehicle's axes ``(3,) [rad]``; ``None`` is no rotation.
+    """
+    mounting = np.zeros(3) if mounting is None else mounting
+    mean = drive.initial.mean
+    cov = columns(form.from_additive, mean, drive.initial.cov)
+    one = FilterParams(model_params(config, drive, lever_arm, mounting), Gaussian(mean, cov))
+    if config.filter == "sage-husa-ekf":
+        one = one._replace(adaptation=sage_husa_params(jnp.array(config.forgetting[0])))
+    if members(config) == 1:
+        return _scaled(one, jnp.array(config.r_factors[0]), jnp.array(config.q_factors[0]))
+    grid = jnp.array(grid_of(config))
+    several = replicate(one, len(grid))
+    if config.filter == "sage-husa-ekf":
+        own = several.adaptation._replace(forgetting=grid[:, 2])
+        several = several._replace(adaptation=own)
+    several = jax.vmap(_scaled)(several, grid[:, 0], grid[:, 1])
+    period = float(np.median(np.asarray(drive.inputs.inertial.dt)))
+    return BankParams(several, rule_params(config, period))
+
+
+def sage_husa_params(forgetting: Array) -> SageHusa:
+    """Return the parameters of a Sage-Husa filter that may find the noise of any receiver."""
+    low, high = NOISE_RANGE
+    plain = SageHusa(forgetting, low=low, high=high)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), plain)
+
+
+def grid_of(config: FilterConfig) -> list[tuple[float, float, float]]:
+    """Return the members of a bank: factor on R, factor on Q, forgetting factor."""
+    return list(itertools.product(config.r_factors, config.q_factors, config.forgetting))
+
+
+def member_names(config: FilterConfig) -> list[str]:
+    """Return a name for each member, with what differs between members alone."""
+    varied = [("R x", config.r_factors), ("Q x", config.q_factors), ("b ", config.forgetting)]
+    return [
+        ", ".join(
+            f"{name}{value:g}"
+            for value, (name, values) in zip(entry, varied, strict=True)
+            if len(values) > 1
+        )
+        for entry in grid_of(config)
+    ]
+
+
+def _scaled(params: FilterParams, r_factor: Array, q_factor: Array) -> FilterParams:
+    """Return parameters with the variances of the receiver and the process noise multiplied."""
+    inner, r, q = params.model.inner, jnp.sqrt(r_factor), jnp.sqrt(q_factor)
+    inner = inner._replace(
+        gyro_noise=q * inner.gyro_noise,
+        accel_noise=q * inner.accel_noise,
+        gyro_walk=q * inner.gyro_walk,
+        accel_walk=q * inner.accel_walk,
+        velocity_noise=r * inner.velocity_noise,
+        position_noise=r * inner.position_noise,
+    )
+    return params._replace(model=params.model._replace(inner=inner))
+
+
+def columns(push: Callable[[Any, Array], Array], x: SinsLevel, cov: Array) -> Array:
+    """Return a covariance in other coordinates, taken there by their derivative ``push(x, d)``."""
+    pushed = jax.vmap(lambda d: push(x, d), in_axes=1, out_axes=1)
+    return pushed(pushed(cov).T)
+
+
+def additive_sigma(form: ErrorForm, estimate: Gaussian) -> Array:
+    """Return standard deviations ``(15,)`` in additive errors of an estimate in a form's."""
+    cov = columns(form.to_additive, estimate.mean, estimate.cov)
+    return jnp.sqrt(jnp.maximum(jnp.diag(cov), 0))
