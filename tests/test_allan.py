@@ -7,21 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.navigation.sensors import allan, imu, noise_fit
 from jaxnav.navigation.sensors.allan import (
-    allan_variance,
     chi_square_ends,
     cluster_sizes,
     deviation_interval,
-    slope_rule,
 )
-from jaxnav.navigation.sensors.imu import NoiseModel, sensor_noise
+from jaxnav.navigation.sensors.imu import NoiseModel
 from jaxnav.navigation.sensors.noise_fit import (
     coefficient_interval,
     covariance_kernel,
-    degrees_of_freedom,
-    fit_noise,
-    model_variance,
 )
+
+# As programs: a kernel for every operation and shape takes longer to compile.
+allan_variance = jax.jit(allan.allan_variance, static_argnames=("step", "sizes", "overlapping"))
+slope_rule = jax.jit(allan.slope_rule, static_argnames="sharpness")
+degrees_of_freedom = jax.jit(
+    noise_fit.degrees_of_freedom, static_argnames=("step", "sizes", "count")
+)
+fit_noise = jax.jit(noise_fit.fit_noise, static_argnames=("step", "sizes", "count"))
+model_variance = jax.jit(noise_fit.model_variance)
+sensor_noise = jax.jit(imu.sensor_noise, static_argnames=("step", "count"))
 
 STEP, COUNT = 0.01, 2**14
 SIZES = cluster_sizes(COUNT)
@@ -41,7 +47,6 @@ def nist_1000() -> jax.Array:
     return jnp.asarray(points)
 
 
-@jax.jit
 def fit_of(measured):
     return fit_noise(measured, STEP, SIZES, COUNT)
 
@@ -114,7 +119,7 @@ def test_gaps_leave_the_expectation(key):
     count, runs, sizes = 3000, 400, (1, 4, 16, 64)
     valid = jnp.ones(count, bool).at[700:1700].set(False)
     rates = jax.random.normal(key, (runs, count))
-    measured = jax.vmap(lambda rate: allan_variance(rate, 1.0, sizes, valid))(rates)
+    measured = jax.jit(jax.vmap(lambda rate: allan_variance(rate, 1.0, sizes, valid)))(rates)
     freedom = degrees_of_freedom(noise_model(N=1.0), 1.0, sizes, count, measured.share[0])
     ratio = np.asarray(measured.variance) * sizes
     error = np.sqrt(2 / np.asarray(freedom) / runs)
@@ -339,12 +344,13 @@ def test_gradients_are_those_of_central_differences(key):
 
 
 def test_compiled_equals_eager_in_either_precision(key):
-    step, count = 0.1, 2**9
+    step, count = 0.1, 2**7
     sizes = cluster_sizes(count)
 
     def found(rate):
-        measured = allan_variance(rate, step, sizes)
-        return measured, fit_noise(measured, step, sizes, count), slope_rule(measured, 100.0)
+        measured = allan.allan_variance(rate, step, sizes)
+        fit = noise_fit.fit_noise(measured, step, sizes, count)
+        return measured, fit, allan.slope_rule(measured, 100.0)
 
     rate = jax.random.normal(key, (count,))
     eager, compiled = found(rate), jax.jit(found)(rate)
@@ -364,13 +370,17 @@ def test_noises_follow_their_laws(key):
     step, count, runs = 0.1, 2**10, 200
     sizes = (8, 32, 128)
     tau = step * jnp.asarray(sizes, float)
+
+    @jax.jit
+    def measure(axes):
+        keys = jax.random.split(key, runs)
+        rates = jax.vmap(lambda k: sensor_noise(k, axes, step, count))(keys)
+        assert rates.shape == (runs, count, 3)
+        return jax.vmap(jax.vmap(lambda r: allan_variance(r, step, sizes), 1))(rates)
+
     for model in (noise_model(Q=0.2), noise_model(N=3.0), noise_model(B=2.0), noise_model(K=0.5)):
         axes = NoiseModel(*(jnp.full(3, part) for part in model))
-        rates = jax.vmap(lambda k, axes=axes: sensor_noise(k, axes, step, count))(
-            jax.random.split(key, runs)
-        )
-        assert rates.shape == (runs, count, 3)
-        measured = jax.vmap(jax.vmap(lambda r: allan_variance(r, step, sizes), 1))(rates)
+        measured = measure(axes)
         ratio = measured.variance / model_variance(model, tau)[None, None]
         freedom = np.asarray(degrees_of_freedom(model, step, sizes, count))
         error = np.sqrt(2 / freedom / (3 * runs))

@@ -56,11 +56,14 @@ def test_the_map_is_of_the_noise_and_not_of_the_bias() -> None:
 
 
 FACTORS = (1.0, 3.0, 10.0, 20.0)
+RUNS = 64
+"""Flights at full length, enough of them for every interval that is asserted here; the command line
+runs 150."""
 
 
 @pytest.fixture(scope="module")
 def drift() -> dict[float, Campaign]:
-    return {factor: run_campaign(ArekfConfig(), factor) for factor in FACTORS}
+    return {factor: run_campaign(ArekfConfig(runs=RUNS), factor) for factor in FACTORS}
 
 
 @pytest.mark.slow
@@ -103,7 +106,7 @@ def test_what_the_monte_carlo_finds_is_what_covariance_foretells(
 @pytest.mark.slow
 def test_arekf_is_consistent_and_the_ekf_is_not(drift: dict[float, Campaign]) -> None:
     """All fifteen states at twelve times, initial errors drawn from P0."""
-    low, high = chi2_mean_bounds(15, 150)
+    low, high = chi2_mean_bounds(15, RUNS)
     for factor, campaign in drift.items():
         nees = campaign.mean_curve["nees"]
         nees = nees[epochs_of(len(nees))]
@@ -116,18 +119,18 @@ def test_arekf_is_consistent_and_the_ekf_is_not(drift: dict[float, Campaign]) ->
 
 @pytest.mark.slow
 def test_where_bias_limits_the_filter_its_noise_hardly_matters() -> None:
-    campaign = run_campaign(ArekfConfig(scenario="bias-dominated"), 20.0)
+    campaign = run_campaign(ArekfConfig(scenario="bias-dominated", runs=RUNS), 20.0)
     for kind in KINDS:
         assert change(campaign, "ekf", "arekf", kind).high < 0.1
 
 
 @pytest.mark.slow
 def test_versoria_pays_with_outliers_and_invariance_with_a_lost_heading() -> None:
-    spoiled = run_campaign(ArekfConfig(scenario="outliers"), 1.0)
+    spoiled = run_campaign(ArekfConfig(scenario="outliers", runs=RUNS), 1.0)
     for kind in KINDS:
         assert change(spoiled, "versoria-ekf", "ekf", kind).high < -0.1
-    lost = run_campaign(ArekfConfig(scenario="large-heading-error"), 1.0)
-    low, high = chi2_mean_bounds(15, 150)
+    lost = run_campaign(ArekfConfig(scenario="large-heading-error", runs=RUNS), 1.0)
+    low, high = chi2_mean_bounds(15, RUNS)
     for name in ("liekf", "se23-ekf"):
         for kind in KINDS:
             assert change(lost, name, "ekf", kind).high < -0.2

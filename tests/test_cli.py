@@ -34,7 +34,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 BAD = {
     "unknown command": (("fly",), ("'fly'", "list, run, filter, allan, doctor")),
-    "unknown study": (("run", "imae"), ("'imae'", "immae, mmae-ukf, rkcns, arekf, sage-husa, gnss-track")),
+    "unknown study": (
+        ("run", "imae"),
+        ("'imae'", "immae, mmae-ukf, rkcns, arekf, sage-husa, gnss-track"),
+    ),
     "unknown scenario": (
         ("run", "immae", "--scenario", "calm"),
         ("calm", "matched-noise", "noise-step", "all"),

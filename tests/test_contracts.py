@@ -1,6 +1,7 @@
 """The laws that every filter and bank obeys, over one table of all of them."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,12 +13,14 @@ from jax import Array
 from jaxnav.estimation.banks.imm import imm, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, bank, immae, mmae
 from jaxnav.estimation.banks.weights import (
+    Penalty,
     WindowedReset,
     bayes,
     chain,
     floor,
     forget,
     markov,
+    penalty,
 )
 from jaxnav.estimation.bounds import oracle
 from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
@@ -28,6 +31,7 @@ from jaxnav.estimation.filters.iterated import (
 )
 from jaxnav.estimation.filters.kalman import ekf, kf
 from jaxnav.estimation.filters.robust import Correntropy, Versoria, correntropy, versoria
+from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
 from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
 from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
 from jaxnav.estimation.run import Trace, run
@@ -91,6 +95,11 @@ def single(theta: float = 1.0) -> FilterParams:
     return FilterParams(Noise(jnp.array(theta), jnp.array(1.0)), prior)
 
 
+def noise_adaptation(forgetting: float, prior_count: float) -> SageHusa:
+    """How a filter that estimates its measurement noise does so; 1 and infinity: not at all."""
+    return SageHusa(*map(jnp.array, (forgetting, prior_count, 0.1, 100.0, 0.02)))
+
+
 def plain(name: str) -> FilterParams:
     """Parameters of one filter that leave its noise and its data as they are."""
     settings: dict[str, dict[str, Any]] = {
@@ -99,6 +108,7 @@ def plain(name: str) -> FilterParams:
         "innovation_adaptive": {
             "adaptation": Adaptation(jnp.array(5.0), jnp.array(1.0), jnp.array(1.0))
         },
+        "sage_husa": {"adaptation": noise_adaptation(1.0, jnp.inf)},
     }
     return single()._replace(**settings.get(name, {}))
 
@@ -135,6 +145,7 @@ def _cases() -> dict[str, Case]:
         "versoria": versoria(ekf, dense_model()),
         "correntropy": correntropy(ekf, dense_model(), iterations=1),
         "innovation_adaptive": innovation_adaptive(ekf, dense_model()),
+        "sage_husa": sage_husa(ekf, dense_model(), channels=CHANNELS),
     }
     reset = WindowedReset(jnp.array(5.0), jnp.array(0.9), jnp.array(0.05))
     banks: dict[str, tuple[Filter, Any]] = {
@@ -145,12 +156,15 @@ def _cases() -> dict[str, Case]:
         "floor": (bank(base, chain(bayes(), floor())), ((), jnp.array(1e-3))),
         "forget": (bank(base, chain(forget(), bayes())), (jnp.array(0.95), ())),
         "markov": (bank(base, chain(markov(), bayes())), (jnp.array(0.05), ())),
+        "penalty": (bank(base, penalty()), Penalty(*map(jnp.array, (0.5, 0.15, 9.0, 0.1, 1.0)))),
         "imm": (imm(base), SWITCHING),
         "mmae of ukf": (mmae(singles["ukf"]), ()),
         "immae of ckf": (immae(singles["ckf"]), ((), reset)),
         "mmae of iterated_ckf": (mmae(singles["iterated_ckf"]), ()),
     }
     cases = {name: Case(made, plain(name), plain(name)) for name, made in singles.items()}
+    moving = single()._replace(adaptation=noise_adaptation(0.9, 5.0))
+    cases["sage_husa"] = cases["sage_husa"]._replace(params=moving)
     for name, (made, rule) in banks.items():
         cases[name] = Case(
             made, BankParams(members(*THETA), rule), BankParams(members(1.0, 1.0, 1.0), rule)
@@ -375,8 +389,17 @@ def test_second_call_does_not_trace_again(name: str) -> None:
 
 BOTH_MODES = ("kf", "square_root_kf")
 """Forward mode is what reverse mode transposes: twice is enough for what it costs to compile."""
-COSTLY = ("immae of ckf", "mmae of iterated_ckf", "versoria", "correntropy", "innovation_adaptive")
-"""Members and a rule whose gradients are tested, but not together; the last in test_robust.py."""
+COSTLY = (
+    "immae of ckf",
+    "mmae of iterated_ckf",
+    "versoria",
+    "correntropy",
+    "innovation_adaptive",
+    "sage_husa",
+    "penalty",
+)
+"""Members and rules whose gradients are tested, but not together; the last five in
+test_robust.py and test_sage_husa_filter.py."""
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in COSTLY])
@@ -523,7 +546,10 @@ def test_shapes_that_do_not_fit_are_named(build: Callable[[Model], Filter], wron
         run(build(model), params, PROBLEM.inputs, obs)
 
 
-@pytest.mark.parametrize("build", [versoria, correntropy, innovation_adaptive])
+NOISE_GIVEN = (versoria, correntropy, innovation_adaptive, partial(sage_husa, channels=CHANNELS))
+
+
+@pytest.mark.parametrize("build", NOISE_GIVEN)
 @pytest.mark.parametrize("wrong", MISFITS)
 def test_filters_that_hand_noise_to_their_model_name_it_too(
     build: Callable[[Callable[[Model], Filter], Model], Filter], wrong: str

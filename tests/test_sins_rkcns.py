@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from jaxnav.estimation.filters.iterated import modified_iterated_ckf
 from jaxnav.estimation.filters.sigma_point import ckf
-from jaxnav.estimation.types import FilterParams, Flag, Gaussian, Obs
+from jaxnav.estimation.types import FilterParams, Flag, Gaussian, Model, Obs
 from jaxnav.navigation.atmosphere import RefractionTable, tabulate
 from jaxnav.navigation.earth import GM, MEAN_RADIUS
 from jaxnav.navigation.limb import fitted_model, seen_refraction
@@ -28,8 +28,17 @@ from jaxnav.numerics.lie import dcm_from_euler, so3_exp
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 
 PERIOD, IMU_STEP = 1.0, 0.01
-HEIGHTS = sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS)
-ANGLES = sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, "angle")
+
+
+def compiled(model: Model) -> Model:
+    """A model whose equations are programs: a kernel for every operation takes longer."""
+    equations = ("transition", "process_noise", "observe", "observation_noise")
+    return model._replace(**{name: jax.jit(getattr(model, name)) for name in equations})
+
+
+HEIGHTS = compiled(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS))
+ANGLES = compiled(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, "angle"))
+MODELS: dict[RayForm, Model] = {"height": HEIGHTS, "angle": ANGLES}
 CENTRE = np.array([0.0, MEAN_RADIUS, 0.0])
 
 
@@ -38,6 +47,7 @@ def table() -> RefractionTable:
     return tabulate(18e3, 30e3)
 
 
+@cache
 def params(form: RayForm = "height", density_sigma: float = 0.01) -> SinsRkcnsParams:
     return SinsRkcnsParams(
         gyro_noise=jnp.full(3, 1.0 * DEG_PER_HOUR),
@@ -50,6 +60,7 @@ def params(form: RayForm = "height", density_sigma: float = 0.01) -> SinsRkcnsPa
     )
 
 
+@cache
 def state() -> SinsTotal:
     return SinsTotal(
         dcm=dcm_from_euler(jnp.array(1.4), jnp.array(0.1), jnp.array(-2.0)),
@@ -74,16 +85,18 @@ def limb_stars(x: SinsTotal, heights: tuple[float, ...]) -> Array:
     return jnp.array(found)
 
 
-def seen(x: SinsTotal) -> SinsRkcnsInput:
+@cache
+def seen() -> SinsRkcnsInput:
     """Three stars as they are truly seen; their rays pass between 22 and 27 km."""
+    x = state()
     star = limb_stars(x, (20.9e3, 23.5e3, 26.0e3))
-    position = x.position + jnp.array(CENTRE)
-    angle = jnp.stack([seen_refraction(table(), position, s).angle for s in star])
+    position, given = x.position + jnp.array(CENTRE), table()
+    angle = jax.jit(jax.vmap(lambda s: seen_refraction(given, position, s).angle))(star)
     return SinsRkcnsInput(jnp.array([0.01, -0.02, 0.03]), star, angle, jnp.array(1.0))
 
 
 def test_the_vehicle_falls_freely_and_the_gyros_less_their_drift_turn_it() -> None:
-    x, u = state(), seen(state())
+    x, u = state(), seen()
     moved = HEIGHTS.transition(params(), x, u)
 
     def derivative(t: float, vr: np.ndarray) -> np.ndarray:
@@ -94,7 +107,7 @@ def test_the_vehicle_falls_freely_and_the_gyros_less_their_drift_turn_it() -> No
     end = solve_ivp(derivative, (0, PERIOD), start, rtol=1e-13, atol=1e-9).y[:, -1]
     np.testing.assert_allclose(moved.velocity, end[:3], atol=1e-9)
     np.testing.assert_allclose(moved.position, end[3:], atol=1e-8)
-    turned = x.dcm @ so3_exp(u.dtheta - PERIOD * x.drift)
+    turned = x.dcm @ jax.jit(so3_exp)(u.dtheta - PERIOD * x.drift)
     np.testing.assert_allclose(moved.dcm, turned, atol=1e-15)
     np.testing.assert_array_equal(moved.bias, x.bias)
     np.testing.assert_array_equal(moved.drift, x.drift)
@@ -102,7 +115,7 @@ def test_the_vehicle_falls_freely_and_the_gyros_less_their_drift_turn_it() -> No
 
 def test_the_process_noise_is_that_of_white_rates_and_accelerations() -> None:
     p, s = params(), LAYOUT
-    Q = np.asarray(HEIGHTS.process_noise(p, state(), seen(state())))
+    Q = np.asarray(HEIGHTS.process_noise(p, state(), seen()))
     gyro = float(p.gyro_noise[0] ** 2 * PERIOD * IMU_STEP)
     np.testing.assert_allclose(Q[s.phi, s.phi], gyro * np.eye(3), atol=1e-12 * gyro)
     pushed = p.disturbance**2
@@ -113,7 +126,7 @@ def test_the_process_noise_is_that_of_white_rates_and_accelerations() -> None:
 
 
 def test_at_the_truth_both_forms_explain_what_is_seen() -> None:
-    x, u = state(), seen(state())
+    x, u = state(), seen()
     heights = HEIGHTS.observe(params(), x, u)
     np.testing.assert_allclose(heights[3:6], 0, atol=2.0)
     angles = ANGLES.observe(params("angle"), x, u)
@@ -125,15 +138,18 @@ def test_at_the_truth_both_forms_explain_what_is_seen() -> None:
 
 def test_the_forms_have_the_same_slope_of_height_by_position() -> None:
     """By position, a height has the unit vector across the ray as slope, an angle a multiple."""
-    x, u = state(), seen(state())
+    x, u = state(), seen()
 
-    def channels(dr: Array, form: RayForm) -> Array:
-        at = retract(x, jnp.zeros(15).at[LAYOUT.dr].set(dr))
-        model = {"height": HEIGHTS, "angle": ANGLES}[form]
-        return model.observe(params(form), at, u)[3:6]
+    def slope(form: RayForm) -> Array:
+        given = params(form)
 
-    by_height = jax.jacfwd(lambda dr: channels(dr, "height"))(jnp.zeros(3))
-    by_angle = jax.jacfwd(lambda dr: channels(dr, "angle"))(jnp.zeros(3))
+        def channels(dr: Array) -> Array:
+            at = retract(x, jnp.zeros(15).at[LAYOUT.dr].set(dr))
+            return MODELS[form].observe(given, at, u)[3:6]
+
+        return jax.jit(jax.jacfwd(channels))(jnp.zeros(3))
+
+    by_height, by_angle = slope("height"), slope("angle")
     np.testing.assert_allclose(np.linalg.norm(by_height, axis=1), 1, rtol=2e-3)
     np.testing.assert_allclose(jnp.sum(by_height * u.star, axis=1), 0, atol=2e-3)
     # dR = dh / (dh_a/dR - dh_ray/dR), the divisor being the height's noise per angle, negative.
@@ -145,7 +161,7 @@ def test_the_forms_have_the_same_slope_of_height_by_position() -> None:
 def test_a_height_at_25_km_is_uncertain_by_some_165_m() -> None:
     """(H / R + u) sigma with H / R = 44 and u = 7 to 18 m per arc second (specification)."""
     x = state()
-    noise = HEIGHTS.observation_noise(params(density_sigma=0.0), x, seen(x))
+    noise = HEIGHTS.observation_noise(params(density_sigma=0.0), x, seen())
     sigma = np.sqrt(np.diag(noise))[3:6]
     assert np.all((sigma > 100) & (sigma < 280))
     assert np.all(np.diff(sigma) > 0)
@@ -153,18 +169,17 @@ def test_a_height_at_25_km_is_uncertain_by_some_165_m() -> None:
 
 @pytest.mark.parametrize("form", ["height", "angle"])
 def test_the_additive_noise_is_the_true_one_to_first_order(form: RayForm) -> None:
-    x, u, p = state(), seen(state()), params(form)
-    model = {"height": HEIGHTS, "angle": ANGLES}[form]
+    x, u, p = state(), seen(), params(form)
+    model = MODELS[form]
     assert model.noisy is not None
     variances = model.noisy.noise(p, x, u)
-    zero = jnp.zeros_like(variances)
-    np.testing.assert_array_equal(model.noisy.observe(p, x, zero, u), model.observe(p, x, u))
-    z = model.observe(p, x, u)
+    zero, z = jnp.zeros_like(variances), model.observe(p, x, u)
+    np.testing.assert_array_equal(jax.jit(model.noisy.observe)(p, x, zero, u), z)
 
     def residual(v: Array) -> Array:
         return model.residual(model.noisy.observe(p, x, v, u), z)  # pyright: ignore
 
-    G = jax.jacfwd(residual)(zero)
+    G = jax.jit(jax.jacfwd(residual))(zero)
     R = model.observation_noise(p, x, u)
     np.testing.assert_allclose(R, (G * variances[None]) @ G.T, rtol=1e-9, atol=1e-14)
     common = np.asarray(R)[3:6, 3:6]
@@ -175,20 +190,20 @@ def test_the_additive_noise_is_the_true_one_to_first_order(form: RayForm) -> Non
 
 
 def test_the_noise_of_the_accelerometers_is_that_of_their_mean() -> None:
-    x, u, p = state(), seen(state()), params()
+    x, u, p = state(), seen(), params()
     R = HEIGHTS.observation_noise(p, x, u)
     expected = np.full(3, p.accel_noise[0] ** 2 * IMU_STEP / PERIOD)
     np.testing.assert_allclose(np.diag(R)[-3:], expected, rtol=1e-12)
 
 
 def test_with_no_star_in_view_the_filter_uses_the_rest_and_says_how_much() -> None:
-    x, u = state(), seen(state())
+    x, u = state(), seen()
     lost = u._replace(star=jnp.zeros((3, 3)).at[:, 1].set(-1.0), angle=jnp.full(3, 1e-3))
     cov = jnp.diag(jnp.repeat(jnp.array([1e-5, 0.1, 100.0, 1e-6, 1e-3]), 3) ** 2)
     given = FilterParams(params(), Gaussian(x, cov))
     z = observations(x.dcm, lost.angle, x.bias)
     for filter in (ckf(HEIGHTS), modified_iterated_ckf(HEIGHTS)):
-        start, update = filter.init(given), jax.jit(filter.update)
+        start, update = jax.jit(filter.init)(given), jax.jit(filter.update)
         none = Obs(jnp.full(9, jnp.nan), jnp.zeros(9, bool))
         kept, info = update(given, start, lost, none)
         assert int(info.flags) == Flag.NO_OBSERVATION
@@ -204,7 +219,7 @@ def test_with_no_star_in_view_the_filter_uses_the_rest_and_says_how_much() -> No
 
 def test_no_stars_at_all_leaves_attitude_and_accelerometers() -> None:
     x = state()
-    bare = seen(x)._replace(star=jnp.zeros((0, 3)), angle=jnp.zeros(0))
+    bare = seen()._replace(star=jnp.zeros((0, 3)), angle=jnp.zeros(0))
     assert HEIGHTS.observe(params(), x, bare).shape == (6,)
     R = HEIGHTS.observation_noise(params(), x, bare)
     assert R.shape == (6, 6)

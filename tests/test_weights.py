@@ -1,5 +1,7 @@
 """Weight rules at the edges: underflow, vetoes, padding, and what the smooth reset keeps."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from jaxnav.estimation.banks.imm import uniform_switching
 from jaxnav.estimation.banks.mixture import mixture_info, moment_match
 from jaxnav.estimation.banks.weights import (
+    Penalty,
     WindowedReset,
     bayes,
     chain,
@@ -16,6 +19,7 @@ from jaxnav.estimation.banks.weights import (
     forget,
     markov,
     normalise,
+    penalty,
     switch,
     switched,
     uniform,
@@ -25,8 +29,10 @@ from jaxnav.estimation.types import Flag, Gaussian, Info, WeightRule
 
 MODELS = 3
 RESET = WindowedReset(jnp.array(20.0), jnp.array(0.9), jnp.array(0.05))
+PENALTY = Penalty(*map(jnp.array, (0.3, 0.15, 200.0, 0.2, 0.5)))
 RULES: dict[str, tuple[WeightRule, tuple]] = {
     "bayes": (chain(bayes()), ((),)),
+    "penalty": (chain(penalty()), (PENALTY,)),
     "floor": (chain(bayes(), floor()), ((), jnp.array(1e-6))),
     "forget": (chain(forget(), bayes()), (jnp.array(0.98), ())),
     "markov": (chain(markov(), bayes()), (jnp.array(1e-3), ())),
@@ -38,10 +44,12 @@ each_rule = pytest.mark.parametrize("name", RULES)
 
 
 def info_of(log_likelihood: jax.Array) -> Info:
-    """The part of a bank's info that the rules read."""
+    """The part of a bank's info that the rules read, for innovations of unit variance."""
     zero = jnp.zeros(log_likelihood.shape[0])
     flags = jnp.zeros(log_likelihood.shape[0], jnp.int32)
-    return Info(zero[:, None], jnp.ones((zero.size, 1, 1)), log_likelihood, zero, flags, flags)
+    known = jnp.isfinite(log_likelihood)
+    nis = jnp.where(known, -2 * log_likelihood - math.log(2 * math.pi), 0)
+    return Info(zero[:, None], jnp.ones((zero.size, 1, 1)), log_likelihood, nis, flags, flags)
 
 
 def weigh(
@@ -130,7 +138,7 @@ def test_windows_that_agree_never_reset() -> None:
     np.testing.assert_allclose(weigh("reset", rows), weigh("bayes", rows), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["floor", "forget", "markov", "smooth reset"])
+@pytest.mark.parametrize("name", ["floor", "forget", "markov", "smooth reset", "penalty"])
 def test_gradient_of_a_rules_parameter(name: str) -> None:
     """The gradient by a rule's own parameters is finite and is the central difference."""
     rng = np.random.default_rng(4)
@@ -200,3 +208,105 @@ def test_info_of_a_bank_flags_a_veto_of_all() -> None:
     mixed = mixture_info(normalise(jnp.zeros(MODELS)), info)
     assert mixed.flags == Flag.ALL_MODELS_VETOED
     assert mixed.log_likelihood == 0
+
+
+SEEN = 40
+"""Steps of the tests of the penalty."""
+
+
+def innovations(S: np.ndarray, true: float, seed: int, steps: int = SEEN) -> Info:
+    """Infos ``(T, M)`` of members that all see the same innovations, of a variance ``true``."""
+    nu = np.sqrt(true) * np.random.default_rng(seed).normal(size=(steps, 1))
+    nis = nu**2 / S
+    flags = jnp.zeros(nis.shape, jnp.int32)
+    log_likelihood = -0.5 * (nis + np.log(2 * np.pi * S))
+    variance = np.broadcast_to(S, nis.shape)[..., None, None]
+    wide = jnp.array(np.broadcast_to(nu, nis.shape)[..., None])
+    return Info(wide, jnp.array(variance), jnp.array(log_likelihood), jnp.array(nis), flags, flags)
+
+
+@jax.jit
+def penalised(params: Penalty, infos: Info, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Counts (T,) and log-weights (T, M) of the penalty rule over infos."""
+    rule = penalty()
+
+    def step(carry: tuple, info: Info) -> tuple[tuple, tuple]:
+        carry = rule.update(params, *carry, info, jnp.int32(0))
+        return carry, carry
+
+    return jax.lax.scan(step, (rule.init(params, start), start), infos)[1]
+
+
+def settings(*values: float, **named: float) -> Penalty:
+    """A penalty whose parameters are arrays."""
+    return Penalty(*(jnp.array(value, float) for value in Penalty(*values, **named)))
+
+
+VARIANCES = np.array([1.0, 2.0, 0.3])
+EVEN = normalise(jnp.zeros(3))
+
+
+def test_penalty_of_one_half_and_the_normaliser_is_bayes() -> None:
+    infos = innovations(VARIANCES, 1.0, 7)
+    _, found = penalised(settings(0.5, 0.0, normaliser=1.0), infos, EVEN)
+    np.testing.assert_allclose(found, weigh("bayes", infos.log_likelihood), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "values", [(0.5, 0.15), (0.7, 0.4, 12.0, 0.2, 0.6), (1.0, 0.0, 5.0)], ids=str
+)
+def test_penalty_follows_its_schedule(values: tuple[float, ...]) -> None:
+    """Increasing as in the paper, growing and decaying, decaying; steps without data not counted.
+
+    The weights of the loop are products, so that the schedule is that of the docstring.
+    """
+    infos = innovations(VARIANCES, 1.0, 8)
+    heard = np.random.default_rng(9).uniform(size=SEEN) > 0.3
+    heard[0] = False
+    nothing = jnp.where(jnp.array(heard)[:, None], 0, int(Flag.NO_OBSERVATION)).astype(jnp.int32)
+    kept = jnp.array(heard)[:, None]
+    infos = infos._replace(
+        log_likelihood=jnp.where(kept, infos.log_likelihood, 0),
+        nis=jnp.where(kept, infos.nis, 0),
+        flags=nothing,
+    )
+    count, found = penalised(settings(*values), infos, EVEN)
+    np.testing.assert_array_equal(count, np.cumsum(heard))
+    own, w, k = Penalty(*values), np.ones(3) / 3, 0
+    for i in range(SEEN):
+        if heard[i]:
+            k += 1
+            rho = own.least + own.scale * k**own.exponent * np.exp(-k / own.memory)
+            w = w * np.exp(-rho * np.asarray(infos.nis[i]))
+            w = w * (2 * np.pi * VARIANCES) ** (-own.normaliser / 2)
+            w = w / w.sum()
+        np.testing.assert_allclose(np.exp(found[i]), w, rtol=1e-11)
+
+
+def test_penalty_vetoes_a_failed_member_and_leaves_out_one_that_takes_no_part() -> None:
+    infos = innovations(VARIANCES, 1.0, 10)
+    failed = infos.log_likelihood.at[5].set(-jnp.inf).at[9, 0].set(-jnp.inf)
+    infos = infos._replace(log_likelihood=failed, nis=jnp.where(jnp.isfinite(failed), infos.nis, 0))
+    count, found = penalised(settings(), infos, normalise(jnp.array([0.0, 0.0, -jnp.inf])))
+    np.testing.assert_array_equal(count, np.arange(1, SEEN + 1))
+    # All failed: the weights are kept. Then the first alone, for good.
+    np.testing.assert_array_equal(found[5], found[4])
+    assert np.all(np.isfinite(found[8, :2]))
+    np.testing.assert_array_equal(found[9:, 0], -np.inf)
+    np.testing.assert_array_equal(found[9:, 1], 0)
+    np.testing.assert_array_equal(found[:, 2], -np.inf)
+
+
+def test_without_its_normaliser_the_penalty_prefers_the_larger_noise() -> None:
+    """Members with the true variance of the innovation and with twice that, 400 steps."""
+    infos = innovations(np.array([1.0, 2.0]), 1.0, 11, 400)
+    odds = {}
+    for name, own in (("paper", settings()), ("bayes", settings(0.5, 0.0, normaliser=1.0))):
+        w = penalised(own, infos, normalise(jnp.zeros(2)))[1]
+        odds[name] = np.asarray(w[:, 1] - w[:, 0])
+    # Each datum moves the odds by rho nis / 2 towards the larger variance, whatever it says.
+    assert np.all(np.diff(odds["paper"]) > 0)
+    mean = 0.5 * np.sum(0.5 * np.arange(1, 401) ** 0.15)
+    assert odds["paper"][-1] == pytest.approx(mean, rel=0.2)
+    # The divergence of the true density from the other, (log 2 - 1 / 2) / 2 a step.
+    assert odds["bayes"][-1] == pytest.approx(-200 * (np.log(2) - 0.5), rel=0.5)
