@@ -194,8 +194,9 @@ def test_diverged_runs_are_reported_and_set_the_exit_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A filter that believes neither its sensors nor its prior moves loses the attitude."""
-    mistuned = ("--kf-theta", "1e-12", "--theta", "1e-12", "--p0-attitude-arcsec", "1e-3")
-    code = main(["run", "immae", *TINY, *mistuned, "--weight-floor", "0.5", "--out", str(tmp_path)])
+    theta = [f"{factor}e-12" for factor in (1, 2, 3, 4, 5)]
+    mistuned = ("--kf-theta", "1e-12", "--theta", *theta, "--p0-attitude-arcsec", "1e-3")
+    code = main(["run", "immae", *TINY, *mistuned, "--out", str(tmp_path)])
     assert code == DIVERGED
     assert "of 2 runs diverged" in capsys.readouterr().out
     document = json.loads((tmp_path / "summary.json").read_text())

@@ -71,6 +71,7 @@ MODEL = Model(
     observation_noise=lambda p, x, u: p.R,
 )
 FILTERS: dict[str, Filter] = {name: build(MODEL) for name, build in BUILDERS.items()}
+BANKS: dict[str, Filter] = {name: mmae(FILTERS[name]) for name in RUNS}
 
 
 def static(H: Array, R: Array, P0: Array) -> FilterParams:
@@ -276,8 +277,7 @@ def test_member_that_fails_leaves_the_bank_to_the_others(name: str, broken: floa
     noise = base.model._replace(R=jnp.array([[1.0, 1.0], [broken, 1.0]]))
     params = BankParams(base._replace(model=noise), ())
     z = jnp.array(np.random.default_rng(0).normal(size=(10, 2)))
-    bank = mmae(FILTERS[name])
-    estimate, info = run(bank, params, jnp.zeros(10), observed(z)).record
+    estimate, info = run(BANKS[name], params, jnp.zeros(10), observed(z)).record
     alone = static(jnp.eye(2), jnp.ones(2), jnp.eye(2))
     expected, _ = run(FILTERS[name], alone, jnp.zeros(10), observed(z)).record
     np.testing.assert_allclose(estimate.mean, expected.mean, atol=1e-14)

@@ -272,7 +272,7 @@ def _adaptive_panel(model: Any, one: FilterParams, config: FilterConfig) -> _Pan
     given = {"sage-husa": (), "bank-floor": ((), jnp.array(1e-3)), "bank-penalty": Penalty()}
     params = BankParams(several, given, _priors(rules, {"sage-husa": 0}, count))
     members = [f"b {b:g}, Q x{q:g}" for b, q in grid]
-    base = sage_husa(ekf, model, channels=FIXES.stop)
+    base = sage_husa(ekf, model, channels=FIXES.stop, current=True)
     return _Panel(panel(base, rules), params, tuple(rules), tuple(rules)[1:], members)
 
 

@@ -137,7 +137,7 @@ def build_world(config: SageHusaConfig) -> World:
 
 def added_noise(config: SageHusaConfig) -> Array:
     """Return the standard deviation of the noise added to east and north of each fix ``(T,)``."""
-    time = config.fix_interval_s * jnp.arange(1, config.steps + 1)
+    time = config.fix_interval_s * jnp.arange(1, config.steps + 1, dtype=float)
     first, second = (within(time, span) for span in (config.first_noise_s, config.second_noise_s))
     return jnp.where(first, config.first_noise, jnp.where(second, config.second_noise, 0.0))
 
