@@ -14,7 +14,7 @@ from jaxnav.estimation.types import Gaussian
 from jaxnav.navigation.earth import displaced, offset_between
 from jaxnav.navigation.models.level_errors import SinsLevel, error_form
 from jaxnav.studies.base import ConfigError
-from jaxnav.studies.sage_husa.claims import NOISY, assess, best_single, change
+from jaxnav.studies.sage_husa.claims import NOISY, assess, best_single, change, right_weight
 from jaxnav.studies.sage_husa.config import SageHusaConfig
 from jaxnav.studies.sage_husa.figures import draw
 from jaxnav.studies.sage_husa.methods import BANKS, HORIZONTAL, horizontal, methods_of
@@ -95,19 +95,24 @@ def test_tuned_adapting_r_pays_while_the_fixes_are_noisy(tuned: Campaign) -> Non
         assert change(config, tuned, "oracle", "mmae", interval).high < 0
         rival = best_single(config, tuned, interval)
         assert change(config, tuned, "proposed", rival, interval).low > 0, "nothing to repair"
-        assert change(config, tuned, "proposed-bayes-floor", rival, interval).value < 0.03
+        assert change(config, tuned, "proposed-bayes-floor", "proposed", interval).high < 0
         harm = change(config, tuned, "unnormalised-floor", "proposed-bayes-floor", interval)
-        assert harm.low > 0.2, "without the normaliser the largest S gains"
+        assert harm.low > 0, "the normaliser differs from model to model"
 
 
 @pytest.mark.slow
 def test_mistuned_the_bank_repairs_q(mistuned: Campaign) -> None:
+    """By a tenth where the fixes are good; by less than so few runs can show where they are not."""
     config = config_of("mistuned")
-    for interval in range(3):
-        rival = best_single(config, mistuned, interval)
-        assert change(config, mistuned, "proposed", rival, interval).high < 0
-        bayes = change(config, mistuned, "proposed-bayes-floor", "proposed", interval)
-        assert bayes.low < 0.02, "Bayes' rule with a floor is at least as good"
+    for bank in ("proposed", "proposed-bayes-floor"):
+        rival = best_single(config, mistuned, 1)
+        assert change(config, mistuned, bank, rival, 1).high < -0.03
+        for interval in NOISY:
+            assert change(config, mistuned, bank, rival, interval).low < 0
+            assert change(config, mistuned, bank, "mmae", interval).high < 0
+    share = right_weight(config, mistuned.mean_curve["weights"])[-1]
+    assert share[list(BANKS).index("proposed")] > 0.9
+    assert share[list(BANKS).index("proposed-bayes-floor")] > 0.9
 
 
 @pytest.mark.slow

@@ -141,7 +141,8 @@ def _normaliser_does_nothing(config: SageHusaConfig, campaign: Campaign) -> Clai
         ci95=(worst.low, worst.high),
         verdict=verdict(worst.low <= 0 <= worst.high),
         why=f"MSE without it over that with it, all else the same, in the noisy intervals: {told}; "
-        "it differs from model to model, and without it the model with the largest S gains",
+        "it differs from model to model, and without it the member wins whose S follows the "
+        "innovation the closest",
     )
 
 

@@ -70,7 +70,7 @@ def _draw_right_weight(result: StudyResult, config: SageHusaConfig, path: Path) 
         for name in ("proposed-bayes", *WEIGHED):
             share = right_weight(config, a["mean_weights"][:, banks.index(name)])
             axes.plot(a["time"], share, color=COLOURS[name], label=name)
-        axes.set(xlabel="time [s]", ylabel="mean weight", ylim=(-0.02, 1.02))
+        axes.set(xlabel="time [s]", ylabel="mean weight", ylim=(-0.02, 1.1))
         axes.set_title(f"weight of the members with the Q nearest the truth: {_title(result)}")
         drawing.legend(loc="outside lower center", ncols=5, fontsize=8)
 
@@ -135,7 +135,7 @@ def _draw_radar(result: StudyResult, path: Path) -> None:
                 for (axis, span), most in zip(spokes, top, strict=True)
             ]
             axes.set_xticks(angle, labels, fontsize=8)
-            axes.tick_params(pad=12)
+            axes.tick_params(pad=18)
             axes.set_ylim(0, 1.02)
             axes.set_yticks([0.25, 0.5, 0.75, 1.0], [])
             axes.set_title(title, pad=20)
@@ -158,7 +158,7 @@ def _draw_weights(result: StudyResult, config: SageHusaConfig, path: Path) -> No
                 for value, colour in zip(values, shades(len(values)), strict=True):
                     share = weights[:, a[key] == value].sum(axis=1)
                     axes.plot(a["time"], share, color=colour, label=label.format(value))
-                axes.set_ylim(-0.02, 1.02)
+                axes.set_ylim(-0.02, 1.15)
             row[0].set_ylabel(f"{name}\nmean weight")
         for axes in grid[0]:
             axes.legend(loc="center right", fontsize=8)

@@ -49,7 +49,7 @@ def run_campaign(config: SageHusaConfig, **options: Any) -> Campaign:
     shared = shared_of(config, build_world(config))
     one = run_one(setup_of(config))
     key = jax.random.key(config.seed)
-    return monte_carlo(one, key, config.runs, shared, keep=1, compile_in_turn=True, **options)
+    return monte_carlo(one, key, config.runs, shared, keep=1, **options)
 
 
 def _run_scenario(
