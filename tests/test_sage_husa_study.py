@@ -14,11 +14,12 @@ from jaxnav.estimation.types import Gaussian
 from jaxnav.navigation.earth import displaced, offset_between
 from jaxnav.navigation.models.level_errors import SinsLevel, error_form
 from jaxnav.studies.base import ConfigError
+from jaxnav.studies.sage_husa import study
 from jaxnav.studies.sage_husa.claims import NOISY, assess, best_single, change, right_weight
 from jaxnav.studies.sage_husa.config import SageHusaConfig
 from jaxnav.studies.sage_husa.figures import draw
 from jaxnav.studies.sage_husa.methods import BANKS, HORIZONTAL, horizontal, methods_of
-from jaxnav.studies.sage_husa.study import compared, run_campaign, run_study
+from jaxnav.studies.sage_husa.study import compared, run_campaign
 from tests.oracles.matrices import random_spd
 
 
@@ -130,10 +131,13 @@ def test_oracle_is_consistent_and_the_fixed_filter_is_not(tuned: Campaign) -> No
 
 
 @pytest.mark.slow
-def test_results_hold_every_method_weight_and_figure(tmp_path: Path) -> None:
-    """With two runs, whose program is the one that the campaigns have compiled at another tile."""
-    config = SageHusaConfig(runs=2)
-    (result,) = run_study(config)
+def test_results_hold_every_method_weight_and_figure(
+    tuned: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The campaign is the one of the other tests."""
+    config = config_of("tuned")
+    monkeypatch.setattr(study, "run_campaign", lambda config, **options: tuned)
+    (result,) = study.run_study(config)
     assert list(result.methods) == compared(config)
     assert set(result.methods["proposed"]["mse"]) == {"east", "north"}
     spans = result.methods["proposed"]["mse"]["north"]
