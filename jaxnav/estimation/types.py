@@ -144,6 +144,39 @@ class Model(NamedTuple):
     noisy: NonAdditive | None = None
 
 
+def _itself(u: Input) -> Input:
+    return u
+
+
+def seeing(
+    model: Model,
+    own: Callable[[Params], Params],
+    sensed: Callable[[Input], Input] = _itself,
+) -> Model:
+    """Return a model of wider parameters and inputs that does with its part of them what it did.
+
+    For models that add something to another one: what they change is then replaced.
+
+    Args:
+        model: The model.
+        own: Its parameters as a part of the wider ones.
+        sensed: Its input as a part of the wider one; the default is all of it.
+    """
+    jacobians, noisy = model.jacobians, model.noisy
+    return model._replace(
+        transition=lambda params, x, u: model.transition(own(params), x, sensed(u)),
+        process_noise=lambda params, x, u: model.process_noise(own(params), x, sensed(u)),
+        observe=lambda params, x, u: model.observe(own(params), x, sensed(u)),
+        observation_noise=lambda params, x, u: model.observation_noise(own(params), x, sensed(u)),
+        jacobians=jacobians and (lambda params, x, u: jacobians(own(params), x, sensed(u))),
+        noisy=noisy
+        and NonAdditive(
+            lambda params, x, v, u: noisy.observe(own(params), x, v, sensed(u)),
+            lambda params, x, u: noisy.noise(own(params), x, sensed(u)),
+        ),
+    )
+
+
 class FilterParams(NamedTuple):
     """The parameters of a single filter: what may differ between members of a bank, or be tuned.
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from jax import Array
 
-from jaxnav.estimation.types import FilterParams, Input, Model, NonAdditive, Params, Point
+from jaxnav.estimation.types import FilterParams, Input, Model, Params, Point, seeing
 
 
 class GivenNoise(NamedTuple):
@@ -23,22 +23,13 @@ class GivenNoise(NamedTuple):
 
 def with_given_noise(model: Model) -> Model:
     """Return the model with parameters :class:`GivenNoise`; all else is as it was."""
-    noisy, jacobians = model.noisy, model.jacobians
 
     def process_noise(params: GivenNoise, x: Point, u: Input) -> Array:
         return params.process * model.process_noise(params.own, x, u)
 
-    return model._replace(
-        transition=lambda params, x, u: model.transition(params.own, x, u),
+    return seeing(model, lambda params: params.own)._replace(
         process_noise=process_noise,
-        observe=lambda params, x, u: model.observe(params.own, x, u),
         observation_noise=lambda params, x, u: params.observation,
-        jacobians=jacobians and (lambda params, x, u: jacobians(params.own, x, u)),
-        noisy=noisy
-        and NonAdditive(
-            lambda params, x, v, u: noisy.observe(params.own, x, v, u),
-            lambda params, x, u: noisy.noise(params.own, x, u),
-        ),
     )
 
 

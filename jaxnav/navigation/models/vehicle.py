@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.types import Model
+from jaxnav.estimation.types import Model, seeing
 from jaxnav.navigation.earth import WGS84, Earth, displaced, earth_rate, offset_between
 from jaxnav.navigation.models.level_errors import LevelError, SinsLevel, error_form
 from jaxnav.navigation.models.sins_cns import LAYOUT
@@ -113,19 +113,12 @@ def vehicle(
     Raises:
         ValueError: As :func:`~jaxnav.navigation.models.sins_gnss.sins_gnss`.
     """
-    inner = sins_gnss(error, origin, earth)
+    plain = sins_gnss(error, origin, earth)
+    inner = seeing(plain, lambda params: params.inner, lambda u: u.inertial)
     form = error_form(error, jnp.zeros(3) if origin is None else origin, earth)
-    inner_jacobians = inner.jacobians
-    assert inner_jacobians is not None
-
-    def transition(params: VehicleParams, x: SinsLevel, u: VehicleInput) -> SinsLevel:
-        return inner.transition(params.inner, x, u.inertial)
-
-    def process_noise(params: VehicleParams, x: SinsLevel, u: VehicleInput) -> Array:
-        return inner.process_noise(params.inner, x, u.inertial)
 
     def observe(params: VehicleParams, x: SinsLevel, u: VehicleInput) -> Array:
-        z = inner.observe(params.inner, x, u.inertial)
+        z = inner.observe(params, x, u)
         lag = params.time_offset + u.lag
         acceleration = _felt(x, u) + pull(x.position, x.velocity, earth)
         parts = [z[:3] + lag * acceleration, displaced(z[3:], lag * z[:3], earth)]
@@ -134,7 +127,7 @@ def vehicle(
         return jnp.concatenate(parts)
 
     def observation_noise(params: VehicleParams, x: SinsLevel, u: VehicleInput) -> Array:
-        fixes = u.grade**2 * inner.observation_noise(params.inner, x, u.inertial)
+        fixes = u.grade**2 * inner.observation_noise(params, x, u)
         if not constrained:
             return fixes
         doubt = jnp.minimum(jnp.sum((x.velocity / params.rest_speed) ** 2), MOST_DOUBT)
@@ -148,11 +141,12 @@ def vehicle(
     def jacobians(
         params: VehicleParams, x: SinsLevel, u: VehicleInput
     ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-        moved, fixed = inner_jacobians(params.inner, x, u.inertial)
+        assert inner.jacobians is not None
+        moved, fixed = inner.jacobians(params, x, u)
         assert callable(moved)
         assert callable(fixed)
         lag, s = params.time_offset + u.lag, LAYOUT
-        felt, steered = _felt(x, u), _steered_differential(params, x, u)
+        felt, steered = _felt(x, u), _steered_differential(params, x)
 
         def seen(dx: Array) -> Array:
             d, dz = form.to_additive(x, dx), fixed(dx)
@@ -165,8 +159,6 @@ def vehicle(
         return moved, seen
 
     return inner._replace(
-        transition=transition,
-        process_noise=process_noise,
         observe=observe,
         observation_noise=observation_noise,
         residual=residual,
@@ -188,11 +180,8 @@ def _steered(params: VehicleParams, x: SinsLevel, u: VehicleInput, earth: Earth)
     return matmul(so3_exp(params.mounting), v)[1:]
 
 
-def _steered_differential(
-    params: VehicleParams, x: SinsLevel, u: VehicleInput
-) -> Callable[[Array], Array]:
+def _steered_differential(params: VehicleParams, x: SinsLevel) -> Callable[[Array], Array]:
     """Return the derivative of :func:`_steered` in additive errors, Earth rate left out."""
-    del u
     s, M = LAYOUT, so3_exp(params.mounting)
 
     def differential(d: Array) -> Array:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.types import Gaussian, Model, Obs
+from jaxnav.estimation.types import Gaussian, Model, Obs, seeing
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
@@ -80,21 +80,14 @@ class Run(NamedTuple):
 
 def informed(model: Model) -> Model:
     """Return the model of SINS/GNSS whose fixes have added noise, for those who know it."""
-    jacobians = model.jacobians
-    assert jacobians is not None
 
     def observation_noise(params: DriveParams, x: SinsLevel, u: DriveInput) -> Array:
         horizontal = jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0], u.added.dtype)
         extra = params.knows * u.added**2 * horizontal
         return model.observation_noise(params.own, x, u.sensed) + extra
 
-    return model._replace(
-        transition=lambda params, x, u: model.transition(params.own, x, u.sensed),
-        process_noise=lambda params, x, u: model.process_noise(params.own, x, u.sensed),
-        observe=lambda params, x, u: model.observe(params.own, x, u.sensed),
-        observation_noise=observation_noise,
-        jacobians=lambda params, x, u: jacobians(params.own, x, u.sensed),
-    )
+    own = seeing(model, lambda params: params.own, lambda u: u.sensed)
+    return own._replace(observation_noise=observation_noise)
 
 
 def clock_of(config: SageHusaConfig) -> Clock:
