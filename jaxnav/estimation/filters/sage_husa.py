@@ -141,16 +141,13 @@ def sage_husa(
             return base.update(given(params, 1.0, R), state.inner, u, obs)
 
         inner, info = updated(state.noise)
-        N = mask_noise(state.noise, obs.valid)
-        S = symmetrise(_whitened(L, _whitened(L, info.innovation_cov).T))
+        e = info.innovation
         if form == "residual":
             after = model.observe(params.model, base.estimate(inner).mean, u)
-            e, spread = masked_innovation(model, obs, after), -_spread_after(N, S)
-        else:
-            e, spread = info.innovation, S - N
-        e = solve_lower(L, e)
+            e = masked_innovation(model, obs, after)
+        sample = _sample(form, L, mask_noise(state.noise, obs.valid), e, info.innovation_cov)
         told = obs.valid & scalable & jnp.isfinite(info.log_likelihood)
-        noise = _averaged(own, state, e[:, None] * e[None, :] - spread, told)
+        noise = _averaged(own, state, sample, told)
         if form == "clamped":
             # Applied to what did not arrive too, the smooth clamp would move it step by step.
             variance = jnp.diag(noise)
@@ -158,9 +155,11 @@ def sage_husa(
         if current:
             inner, info = updated(noise)
         if form == "printed":
-            used = mask_noise(noise if current else state.noise, obs.valid)
-            lost = ~cholesky(used).positive_definite
-            info = info._replace(flags=info.flags | _flag(Flag.INDEFINITE, lost))
+            used = cholesky(mask_noise(noise if current else state.noise, obs.valid))
+            lost = ~used.positive_definite
+            info = info._replace(
+                flags=info.flags | jnp.where(lost, int(Flag.INDEFINITE), 0).astype(jnp.int32)
+            )
         moved = state.log_factor
         if own.process != ():
             moved = moved_log_factor(own.process, moved, info, obs)
@@ -193,6 +192,25 @@ def averaging(forgetting: Array | float, count: Array) -> Array:
     return jnp.where(fades, faded, 1 / (count + 1))
 
 
+def _sample(form: NoiseForm, L: Array, N: Array, e: Array, S: Array) -> Array:
+    """Return the sample ``(m, m)`` in units of the model's noise.
+
+    Args:
+        form: Which.
+        L: Factor of the model's noise.
+        N: The noise that was used, masked.
+        e: Innovation, or the residual after the update.
+        S: Covariance of the innovation.
+    """
+    S = symmetrise(_whitened(L, _whitened(L, S).T))
+    e = solve_lower(L, e)
+    spread = S - N
+    if form == "residual":
+        A = _whitened(cholesky(S).factor, N)
+        spread = symmetrise(matmul(A.T, A) - N)  # H P+ H' = N - N inv(S) N
+    return e[:, None] * e[None, :] - spread
+
+
 def _averaged(own: SageHusa, state: SageHusaState, sample: Array, told: Array) -> Array:
     """Return the noise estimate with a sample ``(m, m)`` in the channels that told something."""
     share = averaging(own.forgetting, state.samples + own.prior_count)
@@ -213,13 +231,3 @@ def _clamped(own: SageHusa, variance: Array, smooth: bool) -> Array:
 def _whitened(L: Array, A: Array) -> Array:
     """Return ``inv(L) A`` of a matrix."""
     return jax.vmap(solve_lower, in_axes=(None, 1), out_axes=1)(L, A)
-
-
-def _spread_after(N: Array, S: Array) -> Array:
-    """Return ``H P+ H' = N - N inv(S) N``, all in units of the model's noise."""
-    A = _whitened(cholesky(S).factor, N)
-    return symmetrise(N - matmul(A.T, A))
-
-
-def _flag(flag: Flag, on: Array) -> Array:
-    return jnp.where(on, int(flag), 0).astype(jnp.int32)
