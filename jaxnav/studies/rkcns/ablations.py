@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
 
 
 LINEAR = (
-    Variation("constraint alone", {"stars": 0}, ("ckf",)),
+    Variation("constraint alone", {"stars": 0}, ("ckf",), ("ckf",)),
     Variation("1 star", {"stars": 1}),
     Variation("5 stars", {"stars": 5}, ("ckf",), ("ckf",)),
     Variation("near 20 km", {"tangent_km": (19.0, 21.0)}),
