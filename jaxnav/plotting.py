@@ -49,8 +49,10 @@ COLOURS = {
     "unnormalised-floor": "tab:brown",
     "oracle-r": "0.5",
     "oracle": "black",
+    "filter": "tab:blue",
+    "stopped": "tab:red",
 }
-"""Colour of each method, the same in all figures."""
+"""Colour of each method, the same in all figures; the last two are of a recorded drive."""
 
 
 @contextmanager

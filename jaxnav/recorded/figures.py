@@ -53,10 +53,12 @@ def _track(report: Report, log: DriveLog, path: Path) -> Path:
         axes.plot(*fixes, ".", ms=2.5, color="0.6", label="fixes")
         if log.reference is not None:
             axes.plot(*plane(log.reference.geodetic), color="black", lw=1.5, label="reference")
-        axes.plot(*plane(position), color=COLOURS["immae"], lw=0.9, label="filter")
+        axes.plot(*plane(position), color=COLOURS["filter"], lw=0.9, label="filter")
         rest = position[drive.stopped]
         if len(rest):
-            axes.plot(*plane(rest), "s", ms=5, mfc="none", color=COLOURS["ekf"], label="stopped")
+            axes.plot(
+                *plane(rest), "s", ms=5, mfc="none", color=COLOURS["stopped"], label="stopped"
+            )
         axes.plot(0, 0, "o", ms=5, color="black", label="start")
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("east [m]")
@@ -79,7 +81,7 @@ def _errors(report: Report, path: Path) -> Path:
             bound = 3 * sigma[:, 3 + i]
             axes.fill_between(time, -bound, bound, color="0.85", lw=0, label="±3 sigma, expected")
             axes.plot(
-                time, innovation[:, 3 + i], ".", ms=2, color=COLOURS["immae"], label="difference"
+                time, innovation[:, 3 + i], ".", ms=2, color=COLOURS["filter"], label="difference"
             )
             limit = 1.3 * np.percentile(np.maximum(bound, np.abs(innovation[:, 3 + i])), 99.5)
             axes.set_ylim(-limit, limit)
@@ -100,7 +102,7 @@ def _reference_errors(errors: ReferenceErrors, path: Path) -> Path:
             color="0.6",
             label="receiver",
         )
-        top.plot(errors.time, horizontal(errors.offset), color=COLOURS["immae"], label="filter")
+        top.plot(errors.time, horizontal(errors.offset), color=COLOURS["filter"], label="filter")
         top.set_ylim(bottom=0)
         top.set_ylabel("horizontal error [m]")
         top.legend(ncols=2)
@@ -125,7 +127,7 @@ def _nis(report: Report, path: Path) -> Path:
         axes = drawing.subplots()
         label = f"95 % of chi-square of {usual}"
         axes.axhspan(*bounds, color="0.85", lw=0, label=label)
-        axes.plot(drive.time[at], nis, ".", ms=2, color=COLOURS["immae"], label="at a fix")
+        axes.plot(drive.time[at], nis, ".", ms=2, color=COLOURS["filter"], label="at a fix")
         axes.set_yscale("log")
         axes.set_ylim(*_decades(nis))
         axes.margins(x=0)
@@ -164,7 +166,7 @@ def _outages(outages: Outages, path: Path) -> Path:
                 axes.plot(outages.since[own], error[own], color="0.7", lw=0.8)
             axes.plot([], [], color="0.7", lw=0.8, label="one window")
             grid, median = _median(outages.since, error)
-            axes.plot(grid, median, color=COLOURS["immae"], lw=2, label="median")
+            axes.plot(grid, median, color=COLOURS["filter"], lw=2, label="median")
             end = np.median(outages.at_end[name])
             axes.set_title(f"{_OUTAGES[name]}: {end:.1f} m at the end")
             axes.set_xlabel("time without fixes [s]")
