@@ -51,6 +51,9 @@ if TYPE_CHECKING:
         panel as panel,
     )
     from jaxnav.estimation.banks.weights import (
+        Penalty as Penalty,
+    )
+    from jaxnav.estimation.banks.weights import (
         WindowedReset as WindowedReset,
     )
     from jaxnav.estimation.banks.weights import (
@@ -152,6 +155,7 @@ _HOMES = {
         "panel",
     ),
     "jaxnav.estimation.banks.weights": (
+        "Penalty",
         "WindowedReset",
         "bayes",
         "chain",
