@@ -111,12 +111,8 @@ if TYPE_CHECKING:
     from jaxnav.estimation.montecarlo import monte_carlo as monte_carlo
     from jaxnav.estimation.run import run as run
     from jaxnav.estimation.run import simulate as simulate
-    from jaxnav.estimation.tune import (
-        fit as fit,
-    )
-    from jaxnav.estimation.tune import (
-        negative_log_likelihood as negative_log_likelihood,
-    )
+    from jaxnav.estimation.tune.fit import fit as fit
+    from jaxnav.estimation.tune.losses import negative_log_likelihood as negative_log_likelihood
     from jaxnav.estimation.types import (
         Filter as Filter,
     )
@@ -185,7 +181,8 @@ _HOMES = {
     "jaxnav.estimation.filters.square_root": ("square_root_ekf", "square_root_kf"),
     "jaxnav.estimation.montecarlo": ("RunOutput", "monte_carlo"),
     "jaxnav.estimation.run": ("run", "simulate"),
-    "jaxnav.estimation.tune": ("fit", "negative_log_likelihood"),
+    "jaxnav.estimation.tune.fit": ("fit",),
+    "jaxnav.estimation.tune.losses": ("negative_log_likelihood",),
     "jaxnav.estimation.types": (
         "Filter",
         "FilterParams",

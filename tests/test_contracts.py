@@ -35,7 +35,7 @@ from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
 from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
 from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
 from jaxnav.estimation.run import Trace, run
-from jaxnav.estimation.tune import negative_log_likelihood
+from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs, replicate
 from tests.oracles.kalman import (
     History,

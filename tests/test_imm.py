@@ -14,7 +14,7 @@ from jaxnav.estimation.banks.mixture import BankParams, mmae, moment_match
 from jaxnav.estimation.banks.weights import normalise, switched
 from jaxnav.estimation.filters.kalman import ekf, kf
 from jaxnav.estimation.run import run
-from jaxnav.estimation.tune import negative_log_likelihood
+from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs, replicate
 from jaxnav.navigation.models.sins_total import (
     SinsTotal,

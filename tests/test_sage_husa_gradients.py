@@ -14,7 +14,7 @@ from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
 from jaxnav.estimation.run import run
-from jaxnav.estimation.tune import negative_log_likelihood
+from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Model, Obs, replicate
 from tests.oracles.matrices import central_difference
 

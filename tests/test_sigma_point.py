@@ -9,7 +9,7 @@ from jax import Array
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ckf, drawn, square_root_ukf, ukf
 from jaxnav.estimation.run import run
-from jaxnav.estimation.tune import negative_log_likelihood
+from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Model, Obs
 from jaxnav.numerics.sigma import SigmaRule, cubature, unscented
 from tests.oracles.matrices import random_spd

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.filters.kalman import kf
-from jaxnav.estimation.tune import negative_log_likelihood
+from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
 from jaxnav.studies.gnss_track.study import MODEL, TrackData, filter_params
 

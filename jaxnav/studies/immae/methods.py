@@ -5,6 +5,7 @@ filter's and the informed one. Each method is a weight rule over them, so the co
 filters rather than twenty-two.
 """
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ from jaxnav.estimation.types import (
     Filter,
     FilterParams,
     Gaussian,
+    Model,
     Obs,
     WeightRule,
     replicate,
@@ -86,14 +88,16 @@ class Row(NamedTuple):
     returned: Array
 
 
-def members_filter(period: float, imu_step: float) -> Filter:
+def members_filter(
+    period: float, imu_step: float, model: Callable[[float, float], Model] = sins_cns
+) -> Filter:
     """Return the Kalman filter of the error model, informed where its member is told."""
 
     def informed(member: Member, u: SinsCnsInput) -> FilterParams:
         scale = jnp.where(member.told, u.true_scale, member.model.noise_scale)
         return FilterParams(member.model._replace(noise_scale=scale), member.initial)
 
-    return oracle(kf(sins_cns(period, imu_step)), informed)
+    return oracle(kf(model(period, imu_step)), informed)
 
 
 def panel_params(config: ImmaeConfig) -> BankParams:
@@ -155,8 +159,7 @@ def run_one(chain_name: str, period: float, imu_step: float, models: int) -> Any
         observations = Obs(flight.z, jnp.ones(world.dcm.shape[:2], bool))
         trace = run(comparison, params, flight.inputs, observations, record=_record)
         attitude, weights = trace.record
-        rotation = jax.vmap(_residual_rotation)(attitude.mean, flight.error[:, LAYOUT.phi])
-        error = jnp.einsum("kij,kmj->kmi", world.euler_map, rotation)[..., jnp.array([1, 0, 2])]
+        rotation, error = attitude_errors(attitude.mean, flight.error[:, LAYOUT.phi], world)
         consistency = jax.vmap(jax.vmap(nees))(rotation, attitude.cov)
         weights = weights[:, :, :models]
         row = _row(error, consistency, weights)
@@ -166,6 +169,21 @@ def run_one(chain_name: str, period: float, imu_step: float, models: int) -> Any
         return RunOutput(row, curve, kept)
 
     return run_methods
+
+
+def attitude_errors(estimated: Array, true: Array, world: World) -> tuple[Array, Array]:
+    """Return what is left of the attitude error after correction.
+
+    Args:
+        estimated: ``(K, methods, 3) [rad]`` misalignment by each method.
+        true: ``(K, 3) [rad]`` the true one.
+        world: What all runs share.
+
+    Returns:
+        The rotation that is left and its errors of yaw, pitch, roll, both ``(K, methods, 3)``.
+    """
+    rotation = jax.vmap(_residual_rotation)(estimated, true)
+    return rotation, jnp.einsum("kij,kmj->kmi", world.euler_map, rotation)[..., jnp.array([1, 0, 2])]
 
 
 def _residual_rotation(estimated: Array, true: Array) -> Array:

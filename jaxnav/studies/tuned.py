@@ -1,0 +1,94 @@
+"""What a study offers to be tuned: parameters, simulated data, losses, and how they are judged."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jax import Array
+
+from jaxnav.estimation.tune.transforms import Transform
+
+Values = dict[str, Array]
+"""Parameters by name."""
+
+
+class Parameter(NamedTuple):
+    """A parameter to be tuned.
+
+    Attributes:
+        start: Its hand-set value, a number or an array.
+        transform: Its domain.
+        text: One line: what it is, and its unit.
+    """
+
+    start: Any
+    transform: Transform
+    text: str
+
+
+class HeldOut(Protocol):
+    """Judges values on runs that no fit has seen, beside the methods they are compared with."""
+
+    def __call__(self, values: Values, key: Array, runs: int) -> dict[str, np.ndarray]:
+        """Return the measure of each run ``(runs,)``, by method.
+
+        Of "tuned", the hard rule at ``values``, and of every rival; all on the same runs.
+        """
+        ...
+
+
+class Measure(NamedTuple):
+    """What the scores of runs are.
+
+    Attributes:
+        kind: "mean-square", of which the root of the mean is shown and ratios of roots are
+            compared; or "mean", of which the mean is shown and differences are compared.
+        text: What it is.
+        unit: Unit of what is shown.
+        scale: What it is divided by to be in that unit.
+    """
+
+    kind: str
+    text: str
+    unit: str
+    scale: float = 1.0
+
+
+class Problem(NamedTuple):
+    """A study as a problem of tuning.
+
+    Attributes:
+        parameters: By name; the start is the hand-set value.
+        draw: ``(key, runs) -> data``, training data of so many runs.
+        loss: ``(values, data) -> scalar``, differentiable in every parameter: the smooth rules.
+        hard: The same of the hard rules; ``None`` if there is no other.
+        held_out: By name, what start and optimum are judged on; the first decides.
+        measure: What their scores are.
+        rivals: Methods that the optimum is compared with, the hand-set start among them.
+        samples: Number of samples that the mean of a likelihood is over, per run; 0 if the loss is
+            no likelihood.
+        runs: Training runs in a batch, by default.
+        steps: Gradient steps, by default.
+        fresh: Whether every step draws a batch of its own.
+        mode: Mode of differentiation, as for :func:`~jaxnav.estimation.tune.fit.fit`.
+        notes: Sentences for the reader of the result.
+    """
+
+    parameters: Mapping[str, Parameter]
+    draw: Callable[[Array, int], Any]
+    loss: Callable[[Values, Any], Array]
+    hard: Callable[[Values, Any], Array] | None
+    held_out: Mapping[str, HeldOut]
+    measure: Measure
+    rivals: tuple[str, ...]
+    samples: int = 0
+    runs: int = 16
+    steps: int = 60
+    fresh: bool = False
+    mode: str = "reverse"
+    notes: tuple[str, ...] = ()
+
+
+def hand_set(problem: Problem) -> dict[str, Any]:
+    """Return the start of every parameter."""
+    return {name: parameter.start for name, parameter in problem.parameters.items()}
