@@ -163,7 +163,5 @@ def fisher(
         )
     covariance = np.linalg.inv(information)
     slope = jax.jit(jax.jacfwd(free.constrain))(free.start)
-    sigma = jax.tree.map(
-        lambda J: np.sqrt(np.einsum("...i,ij,...j->...", J, covariance, J)), slope
-    )
+    sigma = jax.tree.map(lambda J: np.sqrt(np.einsum("...i,ij,...j->...", J, covariance, J)), slope)
     return Uncertainty(free.labels, covariance, sigma)

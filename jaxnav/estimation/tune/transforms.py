@@ -158,11 +158,15 @@ def coordinates(params: Any, transform: Any = POSITIVE) -> Coordinates:
 
     def behind(point: Array) -> Array:
         parts = zip(jnp.split(point, ends), bounded(point), strict=True)
-        return jnp.concatenate([v.reshape(-1) if v.size == u.size else u for u, v in parts if u.size])
+        return jnp.concatenate(
+            [v.reshape(-1) if v.size == u.size else u for u, v in parts if u.size]
+        )
 
     start = jnp.concatenate([piece.reshape(-1) for piece in pieces])
     return Coordinates(
-        start, lambda point: jax.tree.unflatten(structure, bounded(point)), _labels(names, pieces),
+        start,
+        lambda point: jax.tree.unflatten(structure, bounded(point)),
+        _labels(names, pieces),
         behind,
     )
 

@@ -183,7 +183,9 @@ def attitude_errors(estimated: Array, true: Array, world: World) -> tuple[Array,
         The rotation that is left and its errors of yaw, pitch, roll, both ``(K, methods, 3)``.
     """
     rotation = jax.vmap(_residual_rotation)(estimated, true)
-    return rotation, jnp.einsum("kij,kmj->kmi", world.euler_map, rotation)[..., jnp.array([1, 0, 2])]
+    return rotation, jnp.einsum("kij,kmj->kmi", world.euler_map, rotation)[
+        ..., jnp.array([1, 0, 2])
+    ]
 
 
 def _residual_rotation(estimated: Array, true: Array) -> Array:
