@@ -1,4 +1,4 @@
-"""Command line: ``jaxnav list | run | filter | allan | doctor``.
+"""Command line: ``jaxnav list | run | tune | filter | allan | doctor``.
 
 Imports of JAX and the studies wait until a command needs them, so that help is immediate.
 """
@@ -24,6 +24,7 @@ A differentiable filter bank for aided inertial navigation.
 commands:
   list          studies with their scenarios, filters, weight rules
   run STUDY     run a study; `jaxnav run STUDY --help` lists its parameters
+  tune STUDY    tune a study's filters by gradient and judge them on runs held out; also a LOG
   filter LOG    a recorded drive through a filter or a bank; `jaxnav filter --help` lists options
   allan LOG     noise coefficients of an inertial sensor from a log at rest
   doctor        versions, devices, 64-bit floats, compilation cache
@@ -62,6 +63,7 @@ def _dispatch(arguments: list[str]) -> int:
     commands: dict[str, Callable[[list[str]], int]] = {
         "list": _list,
         "run": _run,
+        "tune": _tune,
         "filter": _filter,
         "allan": _allan,
         "doctor": _doctor,
@@ -136,6 +138,56 @@ def _run(rest: list[str]) -> int:
     if parsed.json:
         print_json(results)
     return DIVERGED if any(result.diverged for result in results) else OK
+
+
+def _tune(rest: list[str]) -> int:
+    if not rest or rest[0] in ("-h", "--help"):
+        print(f"usage: jaxnav tune STUDY|LOG [options]; STUDY is {_either(STUDIES)}")
+        return OK if rest else BAD_INPUT
+    name, options = rest[0], rest[1:]
+    recorded = name not in STUDIES
+    if recorded and not Path(name).exists():
+        raise ConfigError(
+            f"there is no study or log {name!r}; it must be a recorded drive or {_either(STUDIES)}"
+        )
+    from jaxnav.options import parse_tune
+    from jaxnav.recorded.config import FilterConfig
+
+    study = None if recorded else STUDIES[name]
+    parsed = parse_tune(
+        name if study else "LOG", study.load("config") if study else FilterConfig, options
+    )
+    if parsed is None:
+        return OK
+    configure_jax()
+    from jaxnav.report import Progress, print_document, print_tuning
+    from jaxnav.results import claim_directory, finite_or_null, write_arrays, write_document
+    from jaxnav.studies.base import plain
+    from jaxnav.tuning.analysis import tune
+    from jaxnav.tuning.figures import draw
+
+    require_x64()
+    problem = study.load("tuning")(parsed.study) if study else _log_problem(name, parsed.study)
+    directory = claim_directory(parsed.out)
+    with Progress(quiet=parsed.json, unit="steps") as progress:
+        report = tune(name, plain(parsed.study), problem, parsed.config, progress)
+    write_arrays(report.arrays, directory / "tuning.npz")
+    figures = draw(report, directory)
+    write_document(report.document, directory / "summary.json")
+    if parsed.json:
+        print_document(finite_or_null(report.document))
+    else:
+        print_tuning(report.document, directory, figures)
+    return OK
+
+
+def _log_problem(path: str, config: Any) -> Any:
+    from jaxnav.datasets.formats import load_drive
+    from jaxnav.recorded.config import check
+    from jaxnav.recorded.tuned import problem
+
+    check(config)
+    return problem(load_drive(Path(path)), config)
 
 
 def _options_after_log(command: str, rest: list[str]) -> list[str] | None:

@@ -12,14 +12,16 @@ import tyro
 from jaxnav.noise_report.config import AllanConfig
 from jaxnav.recorded.config import FilterConfig, from_toml
 from jaxnav.studies.base import ConfigError
+from jaxnav.tuning.config import TuneConfig
 
 
 class Options(NamedTuple):
-    """What a command was asked for."""
+    """What a command was asked for; ``study`` is the configuration that a tuning starts from."""
 
     config: Any
     out: Path
     json: bool
+    study: Any = None
 
 
 def parse_run(study: str, config: type, arguments: list[str]) -> Options | None:
@@ -58,6 +60,20 @@ def parse_filter(arguments: list[str]) -> Options | None:
     return _parse(program, FilterConfig, out, files, arguments, default)
 
 
+def parse_tune(name: str, study: type, arguments: list[str]) -> Options | None:
+    """Parse the options of ``jaxnav tune``, those after the study or the log; as :func:`parse_run`.
+
+    Args:
+        name: What stands for the study in the usage.
+        study: The configuration class that the tuning starts from: every field is a flag that
+            begins with ``--study.``.
+        arguments: The arguments after the study's name.
+    """
+    files = "summary.json, tuning.npz and the figures"
+    program, out = f"jaxnav tune {name}", Path("results") / "tune" / name.lower()
+    return _parse(program, TuneConfig, out, files, arguments, study=study)
+
+
 def _value_of(flag: str, arguments: list[str]) -> str | None:
     """Return the last value of a flag, as ``--flag value`` or ``--flag=value``."""
     found = None
@@ -76,24 +92,25 @@ def _parse(
     files: str,
     arguments: list[str],
     default: Any = None,
+    study: type | None = None,
 ) -> Options | None:
-    """Parse the fields of a configuration, ``--out`` and ``--json``."""
+    """Parse the fields of a configuration, ``--out`` and ``--json``, and those of a study."""
     given = config() if default is None else default
-    options = make_dataclass(
-        "Options",
-        [
-            ("config", tyro.conf.OmitArgPrefixes[config], field(default=given)),
-            ("out", Path, field(default=out)),
-            ("json", bool, field(default=False)),
-        ],
-        frozen=True,
-    )
+    parts: list[Any] = [
+        ("config", tyro.conf.OmitArgPrefixes[config], field(default=given)),
+        ("out", Path, field(default=out)),
+        ("json", bool, field(default=False)),
+    ]
+    if study is not None:
+        parts.append(("study", study, field(default=study())))
+    options = make_dataclass("Options", parts, frozen=True)
     options.__doc__ = (
         f"{(config.__doc__ or program).splitlines()[0]}\n\n"
         "Attributes:\n"
         "    config: Parameters.\n"
         f"    out: Directory for {files}.\n"
         "    json: Print the summary as JSON instead of tables.\n"
+        "    study: What the tuning starts from.\n"
     )
     said = io.StringIO()
     try:
@@ -104,7 +121,7 @@ def _parse(
             print(said.getvalue(), end="")
             return None
         raise ConfigError(_sentence(said.getvalue(), program)) from None
-    return Options(parsed.config, parsed.out, parsed.json)
+    return Options(parsed.config, parsed.out, parsed.json, getattr(parsed, "study", None))
 
 
 def _sentence(box: str, program: str) -> str:

@@ -34,6 +34,11 @@ def rmse(mean_square: np.ndarray) -> Measured:
     return root(float(np.mean(mean_square)), _se(mean_square))
 
 
+def mean(values: np.ndarray) -> Measured:
+    """Return the mean over runs of ``(N,)`` values."""
+    return Measured(float(np.mean(values)), _se(values))
+
+
 def root(mean_square: float, se: float) -> Measured:
     """Return the root of a mean square and its standard error, by the derivative of the root."""
     value = math.sqrt(mean_square)

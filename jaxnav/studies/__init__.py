@@ -16,6 +16,7 @@ class Study(NamedTuple):
         entry: ``module:function`` with ``(config, progress) -> list[StudyResult]``.
         figures: ``module:function`` with ``(result, directory) -> list[Path]``.
         scenarios: ``module:mapping`` from scenario to one line, free of JAX.
+        tuning: ``module:function`` with ``(config) -> Problem``, what can be tuned by gradient.
         check: ``module:function`` with ``(config)`` that raises what the study would refuse, before
             anything is written.
     """
@@ -25,6 +26,7 @@ class Study(NamedTuple):
     entry: str
     figures: str
     scenarios: str
+    tuning: str
     check: str
 
     def load(self, part: str) -> Any:
@@ -40,6 +42,7 @@ STUDIES = {
         entry="jaxnav.studies.immae.study:run_study",
         figures="jaxnav.studies.immae.figures:draw",
         scenarios="jaxnav.studies.immae.config:SCENARIOS",
+        tuning="jaxnav.studies.immae.tuning:problem",
         check="jaxnav.studies.base:check_simulated",
     ),
     "mmae-ukf": Study(
@@ -48,6 +51,7 @@ STUDIES = {
         entry="jaxnav.studies.mmae_ukf.study:run_study",
         figures="jaxnav.studies.mmae_ukf.figures:draw",
         scenarios="jaxnav.studies.mmae_ukf.config:SCENARIOS",
+        tuning="jaxnav.studies.mmae_ukf.tuning:problem",
         check="jaxnav.studies.base:check_simulated",
     ),
     "rkcns": Study(
@@ -56,6 +60,7 @@ STUDIES = {
         entry="jaxnav.studies.rkcns.study:run_study",
         figures="jaxnav.studies.rkcns.figures:draw",
         scenarios="jaxnav.studies.rkcns.config:SCENARIOS",
+        tuning="jaxnav.studies.rkcns.tuning:problem",
         check="jaxnav.studies.rkcns.study:check",
     ),
     "arekf": Study(
@@ -64,6 +69,7 @@ STUDIES = {
         entry="jaxnav.studies.arekf.study:run_study",
         figures="jaxnav.studies.arekf.figures:draw",
         scenarios="jaxnav.studies.arekf.config:SCENARIOS",
+        tuning="jaxnav.studies.arekf.tuning:problem",
         check="jaxnav.studies.base:check_simulated",
     ),
     "sage-husa": Study(
@@ -72,6 +78,7 @@ STUDIES = {
         entry="jaxnav.studies.sage_husa.study:run_study",
         figures="jaxnav.studies.sage_husa.figures:draw",
         scenarios="jaxnav.studies.sage_husa.config:SCENARIOS",
+        tuning="jaxnav.studies.sage_husa.tuning:problem",
         check="jaxnav.studies.base:check_simulated",
     ),
     "gnss-track": Study(
@@ -80,6 +87,7 @@ STUDIES = {
         entry="jaxnav.studies.gnss_track.study:run_study",
         figures="jaxnav.studies.gnss_track.figures:draw",
         scenarios="jaxnav.studies.gnss_track.config:SCENARIOS",
+        tuning="jaxnav.studies.gnss_track.tuning:problem",
         check="jaxnav.studies.gnss_track.study:check",
     ),
 }

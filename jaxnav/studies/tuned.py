@@ -32,7 +32,8 @@ class HeldOut(Protocol):
     def __call__(self, values: Values, key: Array, runs: int) -> dict[str, np.ndarray]:
         """Return the measure of each run ``(runs,)``, by method.
 
-        Of "tuned", the hard rule at ``values``, and of every rival; all on the same runs.
+        Of "tuned", the rules of the loss at ``values``, and of every rival, all on the same runs;
+        a loss of smooth rules has their hard forms at ``values`` among the rivals.
         """
         ...
 
@@ -69,7 +70,10 @@ class Problem(NamedTuple):
             no likelihood.
         runs: Training runs in a batch, by default.
         steps: Gradient steps, by default.
+        rate: Rate of the descent in unconstrained coordinates, by default.
         fresh: Whether every step draws a batch of its own.
+        simulated: Whether ``draw`` simulates; else it gives the same recorded data for every key,
+            and there is nothing to validate on.
         mode: Mode of differentiation, as for :func:`~jaxnav.estimation.tune.fit.fit`.
         notes: Sentences for the reader of the result.
     """
@@ -84,7 +88,9 @@ class Problem(NamedTuple):
     samples: int = 0
     runs: int = 16
     steps: int = 60
+    rate: float = 0.3
     fresh: bool = False
+    simulated: bool = True
     mode: str = "reverse"
     notes: tuple[str, ...] = ()
 

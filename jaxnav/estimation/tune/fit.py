@@ -13,9 +13,6 @@ from jax import Array
 from jaxnav.estimation.tune.transforms import POSITIVE, Coordinates, coordinates
 
 Progress = Callable[[int, int, float], None]
-FEW = 16
-"""Free parameters up to which forward mode costs less than reverse mode, which runs the filter once
-forward, once more to recover what it did not keep, and once backward."""
 
 
 class Fit(NamedTuple):
@@ -43,12 +40,14 @@ class Validation(NamedTuple):
     """A loss on data that the fit does not see, for early stopping.
 
     Attributes:
-        loss: ``(params) -> scalar``.
+        loss: ``(params, *data) -> scalar``.
+        data: What it is given, beside the parameters.
         every: Steps between two checks.
         patience: Checks in a row without a new least loss that end the fit.
     """
 
-    loss: Callable[[Any], Array]
+    loss: Callable[..., Array]
+    data: tuple[Any, ...] = ()
     every: int = 5
     patience: int = 5
 
@@ -97,7 +96,8 @@ def fit(
         ValueError: If a starting value is outside its domain, or the loss there is not finite.
     """
     free = coordinates(start, transform)
-    evaluate = _evaluation(loss, free, batches, mode)
+    own = None if batches is None else lambda number: (batches(number),)
+    evaluate = _evaluation(loss, free, own or (lambda number: ()), mode)
     improve = _improvement(optimiser or optax.adam(optax.cosine_decay_schedule(0.1, steps)))
     check = None if validation is None else _check(validation, free)
 
@@ -157,18 +157,18 @@ def _improvement(optimiser: optax.GradientTransformation) -> _Improvement:
 def _evaluation(
     loss: Callable[..., Array],
     free: Coordinates,
-    batches: Callable[[int], Any] | None,
+    data: Callable[[int], tuple[Any, ...]],
     mode: str,
 ) -> Callable[[Array, int], tuple[float, Array]]:
-    """Return the compiled loss and gradient at a point, for the batch of an evaluation."""
+    """Return the compiled loss and gradient at a point, on the data of an evaluation."""
 
-    def at(point: Array, batch: tuple[Any, ...]) -> Array:
-        return loss(free.constrain(point), *batch)
+    def at(point: Array, given: tuple[Any, ...]) -> Array:
+        return loss(free.constrain(point), *given)
 
     graded = jax.jit(value_and_gradient(at, mode))
 
     def evaluate(point: Array, number: int) -> tuple[float, Array]:
-        value, gradient = graded(point, () if batches is None else (batches(number),))
+        value, gradient = graded(point, data(number))
         return float(value), gradient
 
     return evaluate
@@ -203,8 +203,8 @@ def value_and_gradient(
 
 
 def _check(validation: Validation, free: Coordinates) -> Callable[[Array], float]:
-    compiled = jax.jit(lambda point: validation.loss(free.constrain(point)))
-    return lambda point: float(compiled(point))
+    compiled = jax.jit(lambda point, data: validation.loss(free.constrain(point), *data))
+    return lambda point: float(compiled(point, validation.data))
 
 
 def _require_start(value: float, gradient: Array, start: Any) -> None:
@@ -217,9 +217,10 @@ def _finite(value: float, gradient: Array) -> bool:
 
 
 def fit_lbfgs(
-    loss: Callable[[Any], Array],
+    loss: Callable[..., Array],
     start: Any,
     *,
+    data: tuple[Any, ...] = (),
     transform: Any = POSITIVE,
     steps: int = 60,
     mode: str = "reverse",
@@ -231,8 +232,9 @@ def fit_lbfgs(
     or its gradient is not finite is shown to the line search as a wall, from which it steps back.
 
     Args:
-        loss: ``(params) -> scalar``.
+        loss: ``(params, *data) -> scalar``.
         start: As for :func:`fit`; so are ``transform``, ``mode`` and ``progress``.
+        data: What the loss is given, beside the parameters.
         transform: See above.
         steps: Largest number of evaluations.
         mode: See above.
@@ -245,7 +247,7 @@ def fit_lbfgs(
         Byrd, Lu, Nocedal, Zhu (1995), SIAM J. Sci. Comput. 16(5), in scipy's implementation.
     """
     free = coordinates(start, transform)
-    evaluate = _evaluation(loss, free, None, mode)
+    evaluate = _evaluation(loss, free, lambda number: data, mode)
     value, gradient = evaluate(free.start, 0)
     _require_start(value, gradient, start)
     history: list[float] = []

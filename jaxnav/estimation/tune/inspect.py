@@ -4,12 +4,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxnav.estimation.tune.fit import value_and_gradient
-from jaxnav.estimation.tune.transforms import POSITIVE, coordinates
+from jaxnav.estimation.tune.transforms import POSITIVE, Coordinates, coordinates
 
 
 class GradientCheck(NamedTuple):
@@ -29,9 +28,10 @@ class GradientCheck(NamedTuple):
 
 
 def check_gradient(
-    loss: Callable[[Any], Array],
+    loss: Callable[..., Array],
     params: Any,
     *,
+    data: tuple[Any, ...] = (),
     transform: Any = POSITIVE,
     step: float = 1e-4,
     mode: str = "reverse",
@@ -41,14 +41,15 @@ def check_gradient(
     The differences err by the square of the step and by the rounding of the loss over the step.
 
     Args:
-        loss: ``(params) -> scalar``.
+        loss: ``(params, *data) -> scalar``.
         params: Where.
+        data: What the loss is given, beside the parameters.
         transform: As for :func:`~jaxnav.estimation.tune.fit.fit`; so is ``mode``.
         step: Half the distance of the differences.
         mode: See above.
     """
     free = coordinates(params, transform)
-    graded = jax.jit(value_and_gradient(lambda point: loss(free.constrain(point)), mode))
+    graded = _graded(loss, free, data, mode)
     gradient = np.asarray(graded(free.start)[1])
     offsets = step * np.eye(free.start.size)
     difference = np.array(
@@ -60,6 +61,15 @@ def check_gradient(
     largest = np.max(np.abs(difference))
     error = float(np.max(np.abs(gradient - difference)) / largest) if largest > 0 else 0.0
     return GradientCheck(free.labels, gradient, difference, error)
+
+
+def _graded(
+    loss: Callable[..., Array], free: Coordinates, data: tuple[Any, ...], mode: str
+) -> Callable[[Array], tuple[Array, Array]]:
+    compiled = jax.jit(
+        value_and_gradient(lambda point, data: loss(free.constrain(point), *data), mode)
+    )
+    return lambda point: compiled(point, data)
 
 
 class Profile(NamedTuple):
@@ -80,9 +90,10 @@ class Profile(NamedTuple):
 
 
 def profile(
-    loss: Callable[[Any], Array],
+    loss: Callable[..., Array],
     params: Any,
     *,
+    data: tuple[Any, ...] = (),
     transform: Any = POSITIVE,
     width: float = 1.0,
     points: int = 9,
@@ -90,19 +101,20 @@ def profile(
     """Evaluate a loss along each parameter, within ``width`` of its real coordinate.
 
     Args:
-        loss: ``(params) -> scalar``.
+        loss: ``(params, *data) -> scalar``.
         params: The middle.
+        data: What the loss is given, beside the parameters.
         transform: As for :func:`~jaxnav.estimation.tune.fit.fit`.
         width: Largest offset in the coordinate, a factor of e for a positive parameter.
         points: Number of offsets; odd, so that the middle is one of them.
     """
     free = coordinates(params, transform)
     offset = np.linspace(-width, width, points)
-    compiled = jax.jit(lambda point: loss(free.constrain(point)))
+    compiled = jax.jit(lambda point, data: loss(free.constrain(point), *data))
     behind = jax.jit(free.values)
     directions = np.eye(free.start.size)
     around = [[free.start + o * d for o in offset] for d in directions]
-    losses = np.array([[float(compiled(point)) for point in row] for row in around])
+    losses = np.array([[float(compiled(point, data)) for point in row] for row in around])
     values = np.array([[behind(point)[i] for point in row] for i, row in enumerate(around)])
     return Profile(free.labels, offset, values, losses)
 
@@ -122,10 +134,11 @@ class Uncertainty(NamedTuple):
 
 
 def fisher(
-    loss: Callable[[Any], Array],
+    loss: Callable[..., Array],
     params: Any,
     samples: int,
     *,
+    data: tuple[Any, ...] = (),
     transform: Any = POSITIVE,
     step: float = 1e-3,
     mode: str = "reverse",
@@ -137,9 +150,10 @@ def fisher(
     domain.
 
     Args:
-        loss: ``(params) -> scalar``, the mean negative log-likelihood per sample [nats].
+        loss: ``(params, *data) -> scalar``, the mean negative log-likelihood per sample [nats].
         params: The optimum.
         samples: Number of samples the mean is over: steps times runs.
+        data: What the loss is given, beside the parameters.
         transform: As for :func:`~jaxnav.estimation.tune.fit.fit`; so is ``mode``.
         step: Half the distance of the differences, in the real coordinates.
         mode: See above.
@@ -149,7 +163,7 @@ def fisher(
             data say nothing about a combination of the parameters.
     """
     free = coordinates(params, transform)
-    graded = jax.jit(value_and_gradient(lambda point: loss(free.constrain(point)), mode))
+    graded = _graded(loss, free, data, mode)
     offsets = step * np.eye(free.start.size)
     rows = [
         np.asarray(graded(free.start + offset)[1] - graded(free.start - offset)[1]) / (2 * step)

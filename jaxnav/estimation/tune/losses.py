@@ -154,7 +154,6 @@ def negative_log_likelihood(
     :func:`~jaxnav.estimation.run.run`; about the root of the number of steps keeps the memory of
     the gradient small.
     """
-
     trace = run(filter, params, inputs, observations, record=_log_likelihood, segment=segment)
     return -jnp.mean(trace.record)
 

@@ -142,7 +142,8 @@ def problem(config: ImmaeConfig) -> Problem:
         measure=Measure(
             "mean-square", "attitude RMSE, root mean over three axes", "arcsec", ARCSEC
         ),
-        rivals=("hand-set", "immae", "markov", "oracle"),
+        rivals=("tuned, hard rule", *PANEL),
+        fresh=True,
         notes=(
             "Q0 and theta together have one factor too many: their product is what is learned.",
         ),
@@ -268,11 +269,11 @@ def _comparison(config: ImmaeConfig) -> Callable[[Array, Any], RunOutput]:
 
     def attitude(state: Any, info: Any) -> Array:
         del info
-        states = state.members.x[:, ATTITUDE_LAYOUT.phi]
         weights = state.log_weights
-        stacked = jnp.stack(list(weights.values())) if isinstance(weights, dict) else weights[None]
+        rows = [weights[name] for name in PANEL] if isinstance(weights, dict) else [weights]
+        stacked = jnp.stack(rows)
         used = jnp.where(active(stacked), jnp.exp(stacked), 0)
-        return used @ states
+        return used @ state.members.x[:, ATTITUDE_LAYOUT.phi]
 
     def one(key: Array, shared: tuple[World, BankParams, BankParams]) -> RunOutput:
         world, own, others = shared

@@ -1,0 +1,1 @@
+"""Behind ``jaxnav tune``: what is asked, the fit, its verdict on held-out runs, and its figures."""
