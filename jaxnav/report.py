@@ -247,7 +247,9 @@ def _values(value: Any) -> str:
 
 def _held_out_table(label: str, entry: dict[str, Any], measure: dict[str, Any]) -> Table:
     ratio = measure["kind"] == "mean-square"
-    table = Table(title=f"{label}, {entry['runs']} runs held out: {escape(measure['text'])}")
+    table = Table(
+        title=f"{label}, {entry['runs']} {measure['per']} held out: {escape(measure['text'])}"
+    )
     table.add_column("method")
     table.add_column(escape(f"[{measure['unit']}]"), justify="right")
     table.add_column("tuned over it" if ratio else "tuned less it", justify="right")

@@ -47,12 +47,14 @@ class Measure(NamedTuple):
         text: What it is.
         unit: Unit of what is shown.
         scale: What it is divided by to be in that unit.
+        per: What each score is of: runs, or pieces of recorded data.
     """
 
     kind: str
     text: str
     unit: str
     scale: float = 1.0
+    per: str = "runs"
 
 
 class Problem(NamedTuple):

@@ -59,8 +59,8 @@ def _held_out(document: dict[str, Any], path: Path) -> Path:
                 axes.errorbar(value[row], row, xerr=error[row], fmt="o", ms=4, color=colour)
             axes.set_yticks(range(len(names)), names)
             axes.invert_yaxis()
-            axes.set_title(f"{label}, {entry['runs']} runs")
             measure = document["measure"]
+            axes.set_title(f"{label}, {entry['runs']} {measure['per']}")
             axes.set_xlabel(f"{measure['text']} [{measure['unit']}], 95 % intervals")
     return path
 
