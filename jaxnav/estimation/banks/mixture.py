@@ -228,7 +228,11 @@ def moment_match(
 
 
 def likeliest(log_weights: Array, means: Any) -> Any:
-    """Return the mean, out of those with a leading axis ``M``, of the largest weight."""
+    """Return the mean, out of those with a leading axis ``M``, of the largest weight.
+
+    It needs no smooth form: a mixture's moments about one point or another are the same to first
+    order in the spread.
+    """
     best = jnp.argmax(log_weights)
     return jax.tree.map(lambda leaf: leaf[best], means)
 

@@ -3,6 +3,13 @@
 A rule is a small filter over the model index (:class:`~jaxnav.estimation.types.WeightRule`); rules
 compose with :func:`chain`. All weights are log-weights and leave each rule normalised; ``-inf``
 marks a member that takes no part and stays ``-inf``.
+
+Rules with a hard decision have a smooth form for gradients, ``smooth=True``, whose temperature is a
+parameter: :func:`floor`, :func:`windowed_reset`. The others are smooth as they are. A decision of a
+filter has one likewise: the line search of an iterated filter (``Search.temperature``), the bounds
+of :func:`~jaxnav.estimation.filters.sage_husa.sage_husa` and
+:func:`~jaxnav.estimation.filters.adaptive.innovation_adaptive`. Where a covariance is refused, the
+update is skipped: that is a failure and not a decision, and it stays hard.
 """
 
 from collections.abc import Callable
@@ -154,22 +161,42 @@ def penalty() -> WeightRule:
     return WeightRule(init, _stay, update)
 
 
-def floor() -> WeightRule:
+class Floor(NamedTuple):
+    """Parameters of the smooth :func:`floor`.
+
+    Attributes:
+        bound: In (0, 1/M).
+        temperature: Width of the smooth maximum of the log-weights; with one, the bound is added to
+            the weights.
+    """
+
+    bound: Array | float
+    temperature: Array | float = 0.1
+
+
+def floor(*, smooth: bool = False) -> WeightRule:
     """Return the lower bound on weights; the parameter is the bound, in (0, 1/M).
 
     Weights below the bound are raised to it and all are normalised again, so a model that was ruled
-    out can come back within a few steps.
+    out can come back within a few steps. With ``smooth=True`` the parameters are :class:`Floor` and
+    the maximum is ``t log(w^(1/t) + bound^(1/t))`` of a temperature ``t``.
 
     References:
         Maybeck and Stevens (1991), IEEE Trans. AES 27(3).
     """
 
     def update(
-        params: Array, state: Any, log_weights: Array, info: Info, k: Array
+        params: Any, state: Any, log_weights: Array, info: Info, k: Array
     ) -> tuple[Any, Array]:
         del info, k
-        raised = jnp.maximum(log_weights, jnp.log(params))
-        return state, normalise(jnp.where(active(log_weights), raised, -jnp.inf))
+        members = active(log_weights)
+        if smooth:
+            t = params.temperature
+            finite = jnp.where(members, log_weights, 0)
+            raised = t * jnp.logaddexp(finite / t, jnp.log(params.bound) / t)
+        else:
+            raised = jnp.maximum(log_weights, jnp.log(params))
+        return state, normalise(jnp.where(members, raised, -jnp.inf))
 
     return WeightRule(_stateless, _stay, update)
 

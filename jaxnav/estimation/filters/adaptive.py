@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -24,11 +25,14 @@ class Adaptation(NamedTuple):
         memory: Updates over which an excess of one moves the factor by ``e``, at least one.
         low: Smallest factor on the process noise.
         high: Largest factor.
+        temperature: Width of the smooth bounds, on a ratio and on the logarithm of the factor; not
+            used by the hard ones.
     """
 
     memory: Array | float = 20.0
     low: Array | float = 1e-2
     high: Array | float = 1e4
+    temperature: Array | float = 0.02
 
 
 class AdaptiveState(NamedTuple):
@@ -38,7 +42,19 @@ class AdaptiveState(NamedTuple):
     log_factor: Array
 
 
-def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filter:
+def softly_clamped(x: Array, low: Array, high: Array, temperature: Array | float) -> Array:
+    """Return ``x`` kept within bounds by softplus functions of a width, the temperature.
+
+    At a distance of several temperatures inside it is ``x``, outside the bound; on a bound it is
+    within the temperature times log 2.
+    """
+    above, below = ((x - bound) / temperature for bound in (low, high))
+    return low + temperature * (jax.nn.softplus(above) - jax.nn.softplus(below))
+
+
+def innovation_adaptive(
+    build: Callable[[Model], Filter], model: Model, *, smooth: bool = False
+) -> Filter:
     """Return a filter that scales its process noise until its innovations are as large as expected.
 
         log s = log s + mean(min(nu^2 / S, 10) - c) / W,   Q = s Q_model,   s in [low, high]
@@ -56,6 +72,7 @@ def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filte
     Args:
         build: The filter to make adaptive; any of this library that takes a model.
         model: The model.
+        smooth: Bound ratio and factor by softplus functions, for gradients.
 
     References:
         Mehra (1972), IEEE Trans. Automatic Control 17(5); Mohamed and Schwarz (1999), Journal of
@@ -76,7 +93,7 @@ def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filte
         own = Adaptation() if params.adaptation == () else params.adaptation
         R = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
         inner, info = base.update(given(params, 1.0, R), state.inner, u, obs)
-        moved = moved_log_factor(own, state.log_factor, info, obs)
+        moved = moved_log_factor(own, state.log_factor, info, obs, smooth=smooth)
         return AdaptiveState(inner, moved), info
 
     def estimate(state: AdaptiveState) -> Gaussian:
@@ -88,7 +105,9 @@ def innovation_adaptive(build: Callable[[Model], Filter], model: Model) -> Filte
     return Filter(init, predict, update, estimate, restart, model.retract, model.local)
 
 
-def moved_log_factor(own: Adaptation, log_factor: Array, info: Info, obs: Obs) -> Array:
+def moved_log_factor(
+    own: Adaptation, log_factor: Array, info: Info, obs: Obs, *, smooth: bool = False
+) -> Array:
     """Return the logarithm of the factor on the process noise after an update.
 
     Args:
@@ -96,11 +115,20 @@ def moved_log_factor(own: Adaptation, log_factor: Array, info: Info, obs: Obs) -
         log_factor: Before.
         info: Of the update.
         obs: Its observation.
+        smooth: Whether the bounds are smooth.
     """
     S = jnp.diag(info.innovation_cov)
     told = obs.valid & (S > 0)
     ratio = info.innovation**2 / jnp.where(told, S, 1)
-    excess = jnp.where(told, jnp.minimum(ratio, LARGEST_RATIO) - MEAN_RATIO, 0)
+    bounded = jnp.minimum(ratio, LARGEST_RATIO)
+    if smooth:
+        bounded = ratio - own.temperature * jax.nn.softplus(
+            (ratio - LARGEST_RATIO) / own.temperature
+        )
+    excess = jnp.where(told, bounded - MEAN_RATIO, 0)
     channels = jnp.maximum(jnp.sum(told), 1).astype(S.dtype)
     step = jnp.sum(excess) / channels / own.memory
-    return jnp.clip(log_factor + step, jnp.log(own.low), jnp.log(own.high)).astype(S.dtype)
+    low, high = jnp.log(own.low), jnp.log(own.high)
+    if smooth:
+        return softly_clamped(log_factor + step, low, high, own.temperature).astype(S.dtype)
+    return jnp.clip(log_factor + step, low, high).astype(S.dtype)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.adaptive import moved_log_factor
+from jaxnav.estimation.filters.adaptive import moved_log_factor, softly_clamped
 from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
 from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, noise_of_channels
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
@@ -162,7 +162,7 @@ def sage_husa(
             )
         moved = state.log_factor
         if own.process != ():
-            moved = moved_log_factor(own.process, moved, info, obs)
+            moved = moved_log_factor(own.process, moved, info, obs, smooth=smooth)
         samples = state.samples + told.astype(state.samples.dtype)
         return SageHusaState(inner, noise, samples, moved), info
 
@@ -224,8 +224,7 @@ def _averaged(own: SageHusa, state: SageHusaState, sample: Array, told: Array) -
 def _clamped(own: SageHusa, variance: Array, smooth: bool) -> Array:
     if not smooth:
         return jnp.clip(variance, own.low, own.high)
-    above, below = ((variance - bound) / own.temperature for bound in (own.low, own.high))
-    return own.low + own.temperature * (jax.nn.softplus(above) - jax.nn.softplus(below))
+    return softly_clamped(variance, own.low, own.high, own.temperature)
 
 
 def _whitened(L: Array, A: Array) -> Array:
