@@ -59,6 +59,8 @@ def finite_or_null(value: Any) -> Any:
         return finite_or_null(value.tolist())
     if isinstance(value, np.generic):
         value = value.item()
+    if isinstance(value, Path):
+        return str(value)
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -92,8 +92,7 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
         simulated=False,
         mode="forward",
         notes=(
-            "standard deviations are those of a filter whose model is right; fixes of a receiver "
-            "depend on each other, which makes them too small",
+            "fixes of a receiver depend on each other, which makes standard deviations too small",
         ),
     )
 

@@ -212,7 +212,7 @@ def _uncertainty(
         )
     except ValueError as error:
         return None, [f"no standard deviations: {error}"]
-    return known, []
+    return known, ["the standard deviations are those of a model that is right"]
 
 
 def _parameters(

@@ -80,7 +80,7 @@ def run_study(
         ConfigError: If no log is given, or 64-bit floats are off.
         DataError: If the log is malformed or too short.
     """
-    track = _load(config)
+    track = load(config)
     names = tuple(SCENARIOS) if config.scenario == "all" else (config.scenario,)
     results = []
     for name in names:
@@ -92,13 +92,14 @@ def run_study(
 
 def check(config: GnssTrackConfig) -> None:
     """Raise what :func:`run_study` would: :class:`ConfigError` or :class:`DataError`."""
-    track = _load(config)
+    track = load(config)
     for name in SCENARIOS if config.scenario == "all" else (config.scenario,):
         scenario = replace(config, scenario=name)
         panel_params(scenario, track_data(scenario, track))
 
 
-def _load(config: GnssTrackConfig) -> GnssTrack:
+def load(config: GnssTrackConfig) -> GnssTrack:
+    """Return the track of a configuration; raises as :func:`run_study` does."""
     require_x64()
     if config.log is None:
         raise ConfigError("log is not given; it must be the path of an RTKLIB .pos file (--log)")
