@@ -169,6 +169,35 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
     return Filter(init, predict, update, estimate, restart, filter.retract, filter.local)
 
 
+def rewatch(rule: WeightRule) -> Filter:
+    """Return a bank whose members have already run: its input is their :class:`Info` of the step.
+
+    The members of a bank never interact, so another rule, or the same with other parameters, needs
+    no filter to run again. Its parameters are :class:`BankParams` without members, its estimate is
+    the log-weights ``(M,)``; observations are not used.
+    """
+
+    def init(params: BankParams) -> BankState:
+        prior = normalise(params.log_prior)
+        return BankState((), rule.init(params.rule, prior), prior, jnp.zeros((), jnp.int32))
+
+    def predict(params: BankParams, state: BankState, u: Info) -> BankState:
+        del u
+        step = state.step + 1
+        moved = rule.predict(params.rule, state.rule, state.log_weights, step)
+        return state._replace(log_weights=moved, step=step)
+
+    def update(params: BankParams, state: BankState, u: Info, obs: Obs) -> tuple[BankState, Array]:
+        del obs
+        memory, moved = rule.update(params.rule, state.rule, state.log_weights, u, state.step)
+        return state._replace(rule=memory, log_weights=moved), moved
+
+    def restart(state: BankState, given: Any) -> BankState:
+        return state._replace(log_weights=given)
+
+    return Filter(init, predict, update, lambda state: state.log_weights, restart)
+
+
 def mmae(filter: Filter) -> Filter:
     """Return multiple-model adaptive estimation: a bank under Bayes' rule (rule parameters ``()``).
 
@@ -181,7 +210,7 @@ def mmae(filter: Filter) -> Filter:
 def immae(filter: Filter, *, smooth: bool = False) -> Filter:
     """Return improved MMAE: Bayes' rule with a windowed reset.
 
-    The rule's parameters are ``((), WindowedReset(...))``.
+    The rule's parameters are ``((), WindowedReset(...))``; ``smooth`` is that of the reset.
 
     References:
         Si, Wang, Niu, Eqs. (5)-(18) and step (5); see

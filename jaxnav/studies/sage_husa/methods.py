@@ -157,7 +157,7 @@ def _members(config: SageHusaConfig) -> list[_Member]:
 
 def shared_of(config: SageHusaConfig, world: World) -> Shared:
     """Return what all runs share."""
-    members = _members(config)
+    listed = _members(config)
     names = methods_of(config)
     decaying = Penalty(
         config.penalty_scale - config.decay_least,
@@ -174,16 +174,22 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
         "proposed-bayes-floor": ((), bound),
     }
     log_priors = {
-        name: jnp.where(jnp.array([name in member.methods for member in members]), 0.0, -jnp.inf)
+        name: jnp.where(jnp.array([name in member.methods for member in listed]), 0.0, -jnp.inf)
         for name in names
     }
     return Shared(
         world,
-        _stacked([(_params_of(config, member), _arrays(member.law)) for member in members]),
+        members_of(config),
         rules,
         log_priors,
         jnp.array([*config.intervals_s, *WINDOWS_S]),
     )
+
+
+def members_of(config: SageHusaConfig) -> tuple[DriveParams, SageHusa]:
+    """Return the parameters of all members, leading axis ``M``; those of the grid come first."""
+    rows = [(_params_of(config, member), _arrays(member.law)) for member in _members(config)]
+    return _stacked(rows)
 
 
 def _params_of(config: SageHusaConfig, member: _Member) -> DriveParams:
