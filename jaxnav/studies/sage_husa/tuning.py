@@ -18,7 +18,7 @@ from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.transforms import POSITIVE, REAL, UNIT, between
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Model, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Model, Obs, replicate
 from jaxnav.navigation.earth import offset_between
 from jaxnav.navigation.models.sins_gnss import CHANNELS, sins_gnss
 from jaxnav.studies.sage_husa.config import SageHusaConfig
@@ -151,15 +151,25 @@ def tuned_bank(smooth: bool) -> Filter:
 def _bank_params(
     config: SageHusaConfig, members: Any, values: Values, start: Gaussian, smooth: bool
 ) -> BankParams:
+    own = _member_params(config, members, values["forgetting"], start)
+    return BankParams(own, _rule_params(values, smooth))
+
+
+def _member_params(
+    config: SageHusaConfig, members: Any, forgetting: Array, start: Gaussian
+) -> FilterParams:
     size = len(config.grid)
     model, law = jax.tree.map(lambda leaf: leaf[:size], members)
-    law = law._replace(forgetting=jnp.repeat(values["forgetting"], len(config.q_scales)))
-    members = FilterParams(model, replicate(start, size), adaptation=law)
+    law = law._replace(forgetting=jnp.repeat(forgetting, len(config.q_scales)))
+    return FilterParams(model, replicate(start, size), adaptation=law)
+
+
+def _rule_params(values: Values, smooth: bool) -> Any:
     rho = Penalty(
         values["penalty_scale"], values["penalty_exponent"], normaliser=values["normaliser"]
     )
     bound = values["weight_floor"]
-    return BankParams(members, (rho, Floor(bound) if smooth else bound))
+    return (rho, Floor(bound) if smooth else bound)
 
 
 def _squares(filter: Filter, params: BankParams, drive: Run, weights: Any) -> Array:
@@ -226,22 +236,45 @@ def _watched_jvp(smooth: bool, primals: Any, tangents: Any) -> tuple[Watched, Wa
     return whole, jax.tree.map(lambda d: d if d.dtype == float0 else moved * d, slope)
 
 
-def _rmse(config: SageHusaConfig, smooth: bool, values: Values, drives: Run) -> Array:
-    """Return the RMSE of the position over drives [m], root mean of east and north."""
-    rule = rewatch(chain(penalty(), floor(smooth=smooth)))
-    members = members_of(config)
-    prior = jnp.zeros(len(config.grid))
+def watch(config: SageHusaConfig, smooth: bool, values: Values, drives: Run) -> Watched:
+    """Run all members over drives, leading axis ``runs``, as extended filters.
 
-    def one(drive: Run) -> Array:
-        params = _bank_params(config, members, values, drive.start, smooth)
-        watched = jax.vmap(partial(_watched, smooth), (0, None), 1)(params.members, drive)
-        own = BankParams((), params.rule, prior)
-        segment = max(1, round(len(drive.fixes.z) ** 0.5))
-        weights = run(rule, own, watched.info, drive.fixes, record=_told, segment=segment).record
+    No rule is needed, so that one run serves any number of them: see :func:`rule_rmse`. It has a
+    derivative by ``values["forgetting"]`` alone.
+
+    Returns:
+        The members' runs, leading axes ``(runs, T, M)``.
+    """
+    members = members_of(config)
+
+    def one(drive: Run) -> Watched:
+        own = _member_params(config, members, values["forgetting"], drive.start)
+        return jax.vmap(partial(_watched, smooth), (0, None), 1)(own, drive)
+
+    return jax.vmap(one)(drives)
+
+
+def rule_rmse(smooth: bool, values: Values, watched: Watched) -> Array:
+    """Return the RMSE of the position [m] by a rule over members that have run.
+
+    Root mean of east and north, over the drives.
+    """
+    rule = rewatch(chain(penalty(), floor(smooth=smooth)))
+    steps, size = watched.error.shape[1:3]
+    params = BankParams((), _rule_params(values, smooth), jnp.zeros(size))
+    silent = Obs(jnp.zeros((steps, 0)), jnp.zeros((steps, 0), bool))
+    segment = max(1, round(steps**0.5))
+
+    def one(watched: Watched) -> Array:
+        weights = run(rule, params, watched.info, silent, record=_told, segment=segment).record
         error = jnp.sum(jnp.exp(weights)[:, :, None] * watched.error, axis=1)
         return jnp.mean(error**2)
 
-    return jnp.sqrt(jnp.mean(jax.vmap(one)(drives)))
+    return jnp.sqrt(jnp.mean(jax.vmap(one)(watched)))
+
+
+def _rmse(config: SageHusaConfig, smooth: bool, values: Values, drives: Run) -> Array:
+    return rule_rmse(smooth, values, watch(config, smooth, values, drives))
 
 
 def _told(state: Any, log_weights: Array) -> Array:
