@@ -5,11 +5,9 @@ compose with :func:`chain`. All weights are log-weights and leave each rule norm
 marks a member that takes no part and stays ``-inf``.
 
 Rules with a hard decision have a smooth form for gradients, ``smooth=True``, whose temperature is a
-parameter: :func:`floor`, :func:`windowed_reset`. The others are smooth as they are. A decision of a
-filter has one likewise: the line search of an iterated filter (``Search.temperature``), the bounds
-of :func:`~jaxnav.estimation.filters.sage_husa.sage_husa` and
-:func:`~jaxnav.estimation.filters.adaptive.innovation_adaptive`. Where a covariance is refused, the
-update is skipped: that is a failure and not a decision, and it stays hard.
+parameter: :func:`floor`, :func:`windowed_reset`; :mod:`jaxnav.estimation.tune` lists them with
+those of the filters. The others are smooth as they are: bounds at the machine epsilon keep a
+logarithm finite and decide nothing.
 """
 
 from collections.abc import Callable
@@ -316,7 +314,10 @@ def windowed_reset(*, smooth: bool = False) -> WeightRule:
     With ``smooth=True`` every step has a gradient: the second set forgets with the time constant
     ``period`` instead of starting anew, and a share
     ``sigmoid((max w - threshold) / temperature) (1 - <w, w2>) / period`` of the weights is replaced
-    by the uniform ones.
+    by the uniform ones. As the temperature falls the threshold becomes hard, and it alone: a
+    restart at multiples of the period has by the period a gradient of nothing but peaks, which grow
+    with ``k``, so a share in each step stands for it. The maximum is as it is, with a kink where
+    two weights of at most 1/2 lead alike.
 
     References:
         Si, Wang, Niu, Eq. (16) and step (5). As printed, Eqs. (15) and (16) are the same recursion;

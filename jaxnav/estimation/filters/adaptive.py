@@ -42,14 +42,19 @@ class AdaptiveState(NamedTuple):
     log_factor: Array
 
 
-def softly_clamped(x: Array, low: Array, high: Array, temperature: Array | float) -> Array:
+def softly_clamped(
+    x: Array, low: Array | float, high: Array | float, temperature: Array | float
+) -> Array:
     """Return ``x`` kept within bounds by softplus functions of a width, the temperature.
 
     At a distance of several temperatures inside it is ``x``, outside the bound; on a bound it is
-    within the temperature times log 2.
+    within the temperature times log 2. It leaves the bounds by rounding alone.
     """
     above, below = ((x - bound) / temperature for bound in (low, high))
-    return low + temperature * (jax.nn.softplus(above) - jax.nn.softplus(below))
+    # softplus(y) = y + softplus(-y): far out the two would cancel and leave their rounding.
+    beyond = (high - low) / temperature + jax.nn.softplus(-above) - jax.nn.softplus(-below)
+    within = jax.nn.softplus(above) - jax.nn.softplus(below)
+    return low + temperature * jnp.where(below > 0, beyond, within)
 
 
 def innovation_adaptive(
@@ -122,13 +127,14 @@ def moved_log_factor(
     ratio = info.innovation**2 / jnp.where(told, S, 1)
     bounded = jnp.minimum(ratio, LARGEST_RATIO)
     if smooth:
-        bounded = ratio - own.temperature * jax.nn.softplus(
-            (ratio - LARGEST_RATIO) / own.temperature
-        )
+        room = (LARGEST_RATIO - ratio) / own.temperature
+        bounded = LARGEST_RATIO - own.temperature * jax.nn.softplus(room)
     excess = jnp.where(told, bounded - MEAN_RATIO, 0)
     channels = jnp.maximum(jnp.sum(told), 1).astype(S.dtype)
     step = jnp.sum(excess) / channels / own.memory
     low, high = jnp.log(own.low), jnp.log(own.high)
     if smooth:
-        return softly_clamped(log_factor + step, low, high, own.temperature).astype(S.dtype)
+        soft = softly_clamped(log_factor + step, low, high, own.temperature)
+        # Applied without data too, the smooth clamp would move the factor step by step.
+        return jnp.where(jnp.any(told), soft, log_factor).astype(S.dtype)
     return jnp.clip(log_factor + step, low, high).astype(S.dtype)

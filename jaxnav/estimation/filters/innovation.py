@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.types import Flag, Gaussian, Info, Model, Obs
-from jaxnav.numerics.linalg import Cholesky, log_det, solve_lower
+from jaxnav.numerics.linalg import Cholesky, log_det_positive, squared_norm
 
 ILL_CONDITIONED_EPS = 1e3
 """Multiple of the machine epsilon below which a Cholesky pivot is called ill-conditioned."""
@@ -104,10 +104,10 @@ def innovation_info(
         indefinite: Whether a covariance had to be mended in this step.
     """
     usable = root.positive_definite
-    whitened = solve_lower(root.factor, nu)
-    nis = jnp.where(usable, jnp.sum(whitened * whitened), 0)
+    nis = jnp.where(usable, squared_norm(root.factor, S, nu), 0)
     channels = jnp.sum(valid).astype(S.dtype)
-    log_likelihood = -0.5 * (nis + log_det(root.factor) + channels * math.log(2 * math.pi))
+    volume = log_det_positive(root.factor, S)
+    log_likelihood = -0.5 * (nis + volume + channels * math.log(2 * math.pi))
     few_digits = root.reciprocal_pivot < ILL_CONDITIONED_EPS * jnp.finfo(S.dtype).eps
     raised = {
         Flag.NO_OBSERVATION: ~jnp.any(valid),

@@ -36,9 +36,9 @@ from jaxnav.estimation.types import (
 )
 from jaxnav.numerics.linalg import (
     cholesky,
+    derived_once,
     matmul,
-    solve_lower,
-    solve_lower_transposed,
+    solve_positive,
     symmetrise,
 )
 
@@ -119,17 +119,17 @@ def ekf(model: Model) -> Filter:
         z_pred, push = observation_map(model, params.model, state.x, u, n)
         nu = masked_innovation(model, obs, z_pred)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
-        HP = push(state.P)
+        HP = derived_once(push(state.P))
         S = jnp.where(obs.valid[:, None] & obs.valid[None], push(HP.T), 0) + R
         root = cholesky(S)
-        gain = solve_lower_transposed(root.factor, solve_lower(root.factor, HP))
-        # S does not couple valid channels with invalid ones, so a zero gain is all that these need;
-        # masks in the products below would keep the compiler from vectorising them. Without the
-        # barrier XLA solves again for each of the n^2 entries that use the gain.
-        gain = jnp.where(obs.valid[:, None] & root.positive_definite, gain, 0)
-        gain = jax.lax.optimization_barrier(gain)
+        # S does not couple valid channels with invalid ones: a zero here is a zero in the gain.
+        heard = jnp.where(obs.valid[:, None] & root.positive_definite, HP, 0)
+        gain = solve_positive(root.factor, S, heard)
         HA = push(state.P - matmul(HP.T, gain))
-        P = state.P - matmul(gain.T, HP) + matmul((matmul(R, gain) - HA).T, gain)
+        # What the Joseph form adds is zero but for rounding, whatever the parameters are, and so is
+        # its derivative.
+        joseph = matmul((matmul(R, gain) - HA).T, gain)
+        P = state.P - matmul(gain.T, HP) + jax.lax.stop_gradient(joseph)
         x = model.retract(state.x, matmul(gain.T, nu))
         return KalmanState(x, P), innovation_info(nu, S, root, obs.valid)
 

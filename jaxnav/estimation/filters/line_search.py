@@ -36,7 +36,8 @@ def step_length(
 
     Args:
         functional: What is to fall, of the length of the step.
-        promised: Its derivative by the length at 0; above 0 counts as 0.
+        promised: Its derivative by the length at 0; above 0 counts as 0, which leaves the smooth
+            step a kink where the derivative vanishes, of ``sufficient`` times its slope.
         search: The numbers of the search.
         trials: Number of lengths, at least one.
 

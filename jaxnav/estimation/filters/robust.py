@@ -23,7 +23,11 @@ from jaxnav.numerics.linalg import cholesky, matmul, solve_lower
 Builder = Callable[[Model], Filter]
 """A filter of a model, such as :func:`~jaxnav.estimation.filters.kalman.ekf`."""
 LEAST_WEIGHT = 1e-8
-"""Smallest weight of a channel: it is then as good as not there, and its noise still finite."""
+"""Smallest weight of a channel: it is then as good as not there, and its noise still finite.
+
+It has no smooth form: the derivative of a weight by the logarithm of its kernel's parameters, which
+it cuts off, is then below 1e-6.
+"""
 
 
 class Versoria(NamedTuple):

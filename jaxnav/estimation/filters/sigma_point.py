@@ -162,8 +162,9 @@ def square_root_ukf(
         [sqrt(R), sqrt(w) d_i; 0, sqrt(w) e_i] Theta = [sqrt(S), 0; K sqrt(S), L]
 
     A negative weight of the centre is taken away afterwards by a downdate; where the difference is
-    not positive definite the centre is left in and :attr:`Flag.INDEFINITE` raised. The caution
-    about several devices of
+    not positive definite the centre is left in and :attr:`Flag.INDEFINITE` raised. At a weight of
+    exactly 0 the derivative by it comes out as 0, as its root has none; that of :func:`ukf` is
+    right. The caution about several devices of
     :func:`~jaxnav.estimation.filters.square_root.square_root_kf` holds here too.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
