@@ -88,7 +88,8 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
         ),
         rivals=("hand-set",),
         samples=half,
-        steps=40,
+        steps=80,
+        optimiser="lbfgs",
         simulated=False,
         mode="forward",
         notes=(

@@ -71,7 +71,8 @@ class Problem(NamedTuple):
         samples: Number of samples that the mean of a likelihood is over, per run; 0 if the loss is
             no likelihood.
         runs: Training runs in a batch, by default.
-        steps: Gradient steps, by default.
+        steps: Gradient steps, by default; evaluations of "lbfgs".
+        optimiser: "adam" or "lbfgs", by default.
         rate: Rate of the descent in unconstrained coordinates, by default.
         fresh: Whether every step draws a batch of its own.
         simulated: Whether ``draw`` simulates; else it gives the same recorded data for every key,
@@ -90,6 +91,7 @@ class Problem(NamedTuple):
     samples: int = 0
     runs: int = 16
     steps: int = 60
+    optimiser: str = "adam"
     rate: float = 0.3
     fresh: bool = False
     simulated: bool = True

@@ -152,7 +152,7 @@ def _descend(
         if progress is not None:
             progress("fit", step, total)
 
-    if config.optimiser == "lbfgs":
+    if (config.optimiser or problem.optimiser) == "lbfgs":
         return fit_lbfgs(
             problem.loss,
             chosen.start,

@@ -20,7 +20,7 @@ class TuneConfig:
         start: Where to begin instead of at the hand-set values, as NAME=VALUE; entries of an array
             are separated by commas.
         bounds: Bounds to stay within, as NAME=LOW:HIGH.
-        optimiser: "adam" on batches, or "lbfgs" on one batch.
+        optimiser: "adam" on batches, or "lbfgs" on one batch. The default is the study's.
         steps: Gradient steps; of "lbfgs", evaluations. The default is the study's.
         rate: Rate of Adam, which falls to zero by a cosine. The default is the study's.
         runs: Training runs in a batch. The default is the study's.
@@ -35,7 +35,7 @@ class TuneConfig:
     params: tuple[str, ...] = ()
     start: tuple[str, ...] = ()
     bounds: tuple[str, ...] = ()
-    optimiser: Literal["adam", "lbfgs"] = "adam"
+    optimiser: Literal["adam", "lbfgs"] | None = None
     steps: int | None = None
     rate: float | None = None
     runs: int | None = None

@@ -186,6 +186,12 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
     )
 
 
+def taking_part(config: SageHusaConfig, names: tuple[str, ...]) -> list[int]:
+    """Return the indices of the members that take part in any of some methods."""
+    listed = enumerate(_members(config))
+    return [i for i, member in listed if any(name in member.methods for name in names)]
+
+
 def members_of(config: SageHusaConfig) -> tuple[DriveParams, SageHusa]:
     """Return the parameters of all members, leading axis ``M``; those of the grid come first."""
     rows = [(_params_of(config, member), _arrays(member.law)) for member in _members(config)]
