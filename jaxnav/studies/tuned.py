@@ -71,6 +71,7 @@ class Problem(NamedTuple):
         samples: Number of samples that the mean of a likelihood is over, per run; 0 if the loss is
             no likelihood.
         runs: Training runs in a batch, by default.
+        validation_runs: Runs that choose the best step, by default.
         steps: Gradient steps, by default; evaluations of "lbfgs".
         optimiser: "adam" or "lbfgs", by default.
         rate: Rate of the descent in unconstrained coordinates, by default.
@@ -90,6 +91,7 @@ class Problem(NamedTuple):
     rivals: tuple[str, ...]
     samples: int = 0
     runs: int = 16
+    validation_runs: int = 32
     steps: int = 60
     optimiser: str = "adam"
     rate: float = 0.3

@@ -115,11 +115,15 @@ def tune(
 
 def _losses(problem: Problem, keys: list[Any], config: TuneConfig) -> _Losses:
     if problem.simulated:
-        data = problem.draw(keys[VALIDATE], config.validation_runs)
+        data = problem.draw(keys[VALIDATE], _validation_runs(problem, config))
     else:
         data = problem.draw(keys[TRAIN], 1)
     hard = None if problem.hard is None else jax.jit(problem.hard)
     return _Losses(jax.jit(problem.loss), hard, data)
+
+
+def _validation_runs(problem: Problem, config: TuneConfig) -> int:
+    return config.validation_runs or problem.validation_runs
 
 
 def _checked(
@@ -200,7 +204,7 @@ def _uncertainty(
     """Return what a likelihood knows of its optimum, or why it does not."""
     if not problem.samples:
         return None, []
-    runs = config.validation_runs if problem.simulated else 1
+    runs = _validation_runs(problem, config) if problem.simulated else 1
     try:
         known = fisher(
             problem.loss,

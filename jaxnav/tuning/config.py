@@ -25,7 +25,8 @@ class TuneConfig:
         rate: Rate of Adam, which falls to zero by a cosine. The default is the study's.
         runs: Training runs in a batch. The default is the study's.
         seed: Root seed of training, validation and held-out runs.
-        validation_runs: Runs that choose the best step and stop the fit early.
+        validation_runs: Runs that choose the best step and stop the fit early. The default is the
+            study's.
         patience: Validations in a row, one in five steps, without a new best one that end the fit.
         held_out_runs: Runs that judge the outcome.
         check_gradient: Compare the gradient at the start with central differences.
@@ -40,11 +41,11 @@ class TuneConfig:
     rate: float | None = None
     runs: int | None = None
     seed: int = 0
-    validation_runs: int = 32
+    validation_runs: int | None = None
     patience: int = 6
     held_out_runs: int = 100
     check_gradient: bool = False
-    profile_points: int = 7
+    profile_points: int = 5
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing.
@@ -53,14 +54,13 @@ class TuneConfig:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
         require_choice(self, "optimiser")
-        for name in ("steps", "runs"):
+        for name in ("steps", "runs", "validation_runs"):
             value = getattr(self, name)
             require(value is None or value >= 1, name, value, "at least 1")
         if self.rate is not None:
             require(0 < self.rate < math.inf, "rate", self.rate, "positive")
         require(0 <= self.seed < 2**63, "seed", self.seed, "between 0 and 2**63 - 1")
-        for name in ("validation_runs", "patience"):
-            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        require(self.patience >= 1, "patience", self.patience, "at least 1")
         require(self.held_out_runs >= 2, "held_out_runs", self.held_out_runs, "at least 2")
         points = self.profile_points
         odd = points == 0 or (points >= 3 and points % 2 == 1)

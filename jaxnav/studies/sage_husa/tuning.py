@@ -85,7 +85,8 @@ def problem(config: SageHusaConfig) -> Problem:
         measure=Measure("mean-square", "RMSE east and north, root mean of both", "m"),
         rivals=("tuned, hard rule", *RIVALS),
         runs=8,
-        steps=40,
+        validation_runs=8,
+        steps=25,
         fresh=True,
     )
 
