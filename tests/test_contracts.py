@@ -10,33 +10,21 @@ import numpy as np
 import pytest
 from jax import Array
 
-from jaxnav.estimation.banks.imm import imm, uniform_switching
-from jaxnav.estimation.banks.mixture import BankParams, bank, immae, mmae
-from jaxnav.estimation.banks.weights import (
-    Penalty,
-    WindowedReset,
-    bayes,
-    chain,
-    floor,
-    forget,
-    markov,
-    penalty,
-)
-from jaxnav.estimation.bounds import oracle
-from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
+from jaxnav.estimation.filters.adaptive import innovation_adaptive
 from jaxnav.estimation.filters.iterated import (
     iterated_ckf,
     iterated_ekf,
     modified_iterated_ckf,
 )
-from jaxnav.estimation.filters.kalman import ekf, kf
-from jaxnav.estimation.filters.robust import Correntropy, Versoria, correntropy, versoria
-from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
-from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
-from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
+from jaxnav.estimation.filters.kalman import ekf
+from jaxnav.estimation.filters.robust import correntropy, versoria
+from jaxnav.estimation.filters.sage_husa import sage_husa
+from jaxnav.estimation.filters.sigma_point import square_root_ukf, ukf
+from jaxnav.estimation.filters.square_root import square_root_ekf
 from jaxnav.estimation.run import Trace, run
 from jaxnav.estimation.tune.losses import negative_log_likelihood
-from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs
+from tests.cases import SWITCHING, THETA, Noise, cases
 from tests.oracles.kalman import (
     History,
     Linear,
@@ -48,19 +36,9 @@ from tests.oracles.kalman import (
     markov_weights,
     mixture,
 )
-from tests.oracles.matrices import central_difference
 
 STEPS, RUNS, STATES, CHANNELS = 12, 6, 4, 2
-THETA = (0.2, 1.0, 8.0)
 LOST = 3
-SWITCHING = uniform_switching(3, 0.05)
-
-
-class Noise(NamedTuple):
-    """Parameters of the test's model: factors on Q and R."""
-
-    q: Array
-    r: Array
 
 
 class Step(NamedTuple):
@@ -95,87 +73,7 @@ def single(theta: float = 1.0) -> FilterParams:
     return FilterParams(Noise(jnp.array(theta), jnp.array(1.0)), prior)
 
 
-def noise_adaptation(forgetting: float, prior_count: float) -> SageHusa:
-    """How a filter that estimates its measurement noise does so; 1 and infinity: not at all."""
-    return SageHusa(*map(jnp.array, (forgetting, prior_count, 0.1, 100.0, 0.02)))
-
-
-def plain(name: str) -> FilterParams:
-    """Parameters of one filter that leave its noise and its data as they are."""
-    settings: dict[str, dict[str, Any]] = {
-        "versoria": {"kernel": Versoria(jnp.array(0.0), jnp.array(2.0))},
-        "correntropy": {"kernel": Correntropy(jnp.array(jnp.inf))},
-        "innovation_adaptive": {
-            "adaptation": Adaptation(jnp.array(5.0), jnp.array(1.0), jnp.array(1.0))
-        },
-        "sage_husa": {"adaptation": noise_adaptation(1.0, jnp.inf)},
-    }
-    return single()._replace(**settings.get(name, {}))
-
-
-def members(*theta: float) -> FilterParams:
-    """Members of a bank that differ in the process noise."""
-    base = replicate(single(), len(theta))
-    return base._replace(model=base.model._replace(q=jnp.array(theta)))
-
-
-class Case(NamedTuple):
-    """A filter with its parameters, and the same made of members that are all alike."""
-
-    filter: Filter
-    params: Any
-    alike: Any
-
-
-def _cases() -> dict[str, Case]:
-    base = kf(dense_model())
-    singles = {
-        "kf": base,
-        "square_root_kf": square_root_kf(dense_model()),
-        "oracle": oracle(base, lambda params, u: params),
-        "ekf": ekf(dense_model()),
-        "square_root_ekf": square_root_ekf(dense_model()),
-        "ukf": ukf(dense_model()),
-        "ckf": ckf(dense_model()),
-        "square_root_ukf": square_root_ukf(dense_model()),
-        "square_root_ckf": square_root_ckf(dense_model()),
-        "iterated_ekf": iterated_ekf(dense_model()),
-        "iterated_ckf": iterated_ckf(dense_model()),
-        "modified_iterated_ckf": modified_iterated_ckf(dense_model()),
-        "versoria": versoria(ekf, dense_model()),
-        "correntropy": correntropy(ekf, dense_model(), iterations=1),
-        "innovation_adaptive": innovation_adaptive(ekf, dense_model()),
-        "sage_husa": sage_husa(ekf, dense_model(), channels=CHANNELS),
-    }
-    reset = WindowedReset(jnp.array(5.0), jnp.array(0.9), jnp.array(0.05))
-    banks: dict[str, tuple[Filter, Any]] = {
-        "mmae": (mmae(base), ()),
-        "mmae of square roots": (mmae(square_root_kf(dense_model())), ()),
-        "immae": (immae(base), ((), reset)),
-        "immae, smooth": (immae(base, smooth=True), ((), reset)),
-        "floor": (bank(base, chain(bayes(), floor())), ((), jnp.array(1e-3))),
-        "forget": (bank(base, chain(forget(), bayes())), (jnp.array(0.95), ())),
-        "markov": (bank(base, chain(markov(), bayes())), (jnp.array(0.05), ())),
-        "penalty": (bank(base, penalty()), Penalty(*map(jnp.array, (0.5, 0.15, 9.0, 0.1, 1.0)))),
-        "imm": (imm(base), SWITCHING),
-        "mmae of ukf": (mmae(singles["ukf"]), ()),
-        "immae of ckf": (immae(singles["ckf"]), ((), reset)),
-        "mmae of iterated_ckf": (mmae(singles["iterated_ckf"]), ()),
-    }
-    cases = {name: Case(made, plain(name), plain(name)) for name, made in singles.items()}
-    moving = single()._replace(adaptation=noise_adaptation(0.9, 5.0))
-    cases["sage_husa"] = cases["sage_husa"]._replace(params=moving)
-    for name, (made, rule) in banks.items():
-        cases[name] = Case(
-            made, BankParams(members(*THETA), rule), BankParams(members(1.0, 1.0, 1.0), rule)
-        )
-    cases["bank of one"] = Case(
-        mmae(base), BankParams(members(1.0), ()), BankParams(members(1.0), ())
-    )
-    return cases
-
-
-CASES = _cases()
+CASES = cases(dense_model(), single(), CHANNELS)
 each_case = pytest.mark.parametrize("name", CASES)
 
 
@@ -385,49 +283,6 @@ def test_second_call_does_not_trace_again(name: str) -> None:
     for scale in (1.0, 2.0, 3.0):
         batch_run(name, CASES[name].params, scale * PROBLEM.z)
     assert _TRACED[name] == 1
-
-
-BOTH_MODES = ("kf", "square_root_kf")
-"""Forward mode is what reverse mode transposes: twice is enough for what it costs to compile."""
-COSTLY = (
-    "immae of ckf",
-    "mmae of iterated_ckf",
-    "versoria",
-    "correntropy",
-    "innovation_adaptive",
-    "sage_husa",
-    "penalty",
-)
-"""Members and rules whose gradients are tested, but not together; the last five in
-test_robust.py and test_sage_husa_gradients.py."""
-
-
-@pytest.mark.parametrize("name", [name for name in CASES if name not in COSTLY])
-def test_gradient_of_the_likelihood(name: str) -> None:
-    """By the factors on Q and R, against central differences of the compiled run."""
-    filter, params, _ = CASES[name]
-    observations = Obs(PROBLEM.z[0], PROBLEM.valid)
-    point = jnp.array([0.1, -0.2])
-
-    def noisy(log_noise: Array) -> Any:
-        factors = jnp.exp(log_noise)
-        inner = params.members if isinstance(params, BankParams) else params
-        moved = inner._replace(model=Noise(inner.model.q * factors[0], inner.model.r * factors[1]))
-        return params._replace(members=moved) if isinstance(params, BankParams) else moved
-
-    def loss(log_noise: Array) -> Array:
-        return negative_log_likelihood(filter, noisy(log_noise), PROBLEM.inputs, observations)
-
-    def values(log_noise: np.ndarray) -> np.ndarray:
-        _, info = batch_run(name, noisy(jnp.asarray(log_noise)), PROBLEM.z).record
-        return -np.mean(info.log_likelihood[0])
-
-    expected = [central_difference(values, np.asarray(point), e, 1e-3) for e in np.eye(2)]
-    np.testing.assert_allclose(jax.jit(jax.grad(loss))(point), expected, rtol=1e-9, atol=1e-10)
-    if name in BOTH_MODES:
-        np.testing.assert_allclose(
-            jax.jit(jax.jacfwd(loss))(point), expected, rtol=1e-9, atol=1e-10
-        )
 
 
 def test_covariance_is_shared_by_runs_that_share_their_inputs() -> None:

@@ -168,6 +168,80 @@ def log_det(L: Array) -> Array:
     return 2 * jnp.sum(jnp.log(jnp.diag(L)))
 
 
+@jax.custom_jvp
+def solve_positive(L: Array, S: Array, B: Array) -> Array:
+    """Return ``inv(S) B`` from the lower Cholesky factor ``L`` of ``S``, all that the value reads.
+
+    The derivative is that of ``inv(S) B`` and leaves the factorisation out: a fraction of the work.
+
+    Args:
+        L: ``(m, m)``.
+        S: ``(m, m)`` symmetric.
+        B: ``(m, n)`` or ``(m,)``.
+    """
+    del S
+    # Without the barrier XLA solves again for each of the entries that use the solution.
+    return jax.lax.optimization_barrier(solve_lower_transposed(L, solve_lower(L, B)))
+
+
+@solve_positive.defjvp
+def _solve_positive_jvp(
+    primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    (L, S, B), (_, dS, dB) = primals, tangents
+    X = solve_positive(L, S, B)
+    return X, solve_positive(L, S, dB - matmul(dS, X))
+
+
+@jax.custom_jvp
+def squared_norm(L: Array, S: Array, v: Array) -> Array:
+    """Return ``v' inv(S) v``, ``v`` ``(m,)``; factor and derivative as :func:`solve_positive`."""
+    del S
+    white = solve_lower(L, v)
+    return jnp.sum(white * white)
+
+
+@squared_norm.defjvp
+def _squared_norm_jvp(
+    primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    (L, S, v), (_, dS, dv) = primals, tangents
+    x = solve_positive(L, S, v)
+    return squared_norm(L, S, v), jnp.sum(x * (2 * dv - matmul(dS, x)))
+
+
+@jax.custom_jvp
+def log_det_positive(L: Array, S: Array) -> Array:
+    """Return ``log|S|``; factor and derivative as :func:`solve_positive`."""
+    del S
+    return log_det(L)
+
+
+@log_det_positive.defjvp
+def _log_det_positive_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    L, S = primals
+    inverse = solve_positive(L, S, jnp.eye(L.shape[0], dtype=L.dtype))
+    return log_det(L), jnp.sum(inverse * tangents[1])
+
+
+@jax.custom_jvp
+def derived_once(A: Array) -> Array:
+    """Return ``A`` ``(m, n)`` as it is; its derivative is computed once wherever it is used.
+
+    XLA on CPUs would fuse it into every loop that reads it (see :func:`materialised`); a sum, over
+    one entry each and zeros, it does not. For matrices of few rows.
+    """
+    return A
+
+
+@derived_once.defjvp
+def _derived_once_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    one = jnp.eye(primals[0].shape[0], dtype=bool)
+    return primals[0], jnp.sum(jnp.where(one[:, :, None], tangents[0][None], 0), axis=1)
+
+
 def tria(A: Array) -> Array:
     """Return the lower-triangular ``L`` ``(n, n)`` with ``L L' = A A'`` for wide ``A`` ``(n, k)``.
 

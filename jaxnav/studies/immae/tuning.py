@@ -105,13 +105,13 @@ def burst(key: Array, steps: int) -> Array:
     """Draw a true factor on Q0 ``(steps,)``: one, and in one span of the flight more.
 
     The span begins between a tenth and half of the flight and lasts a tenth to four tenths of it;
-    the factor is between 3 and 30, evenly in its logarithm.
+    the factor is between 5 and 20, evenly in its logarithm.
     """
     begin, length, level = jax.random.uniform(key, (3,))
     at = jnp.arange(steps) / steps
     first = 0.1 + 0.4 * begin
     inside = (at >= first) & (at < first + 0.1 + 0.3 * length)
-    return jnp.where(inside, 3 * 10**level, 1.0)
+    return jnp.where(inside, 5 * 4**level, 1.0)
 
 
 def two_bursts(steps: int) -> Array:

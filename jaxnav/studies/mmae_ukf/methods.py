@@ -215,7 +215,7 @@ class _Seen(NamedTuple):
     weights: Array
 
 
-def _attitude(log_weights: Array, members: Any) -> Gaussian:
+def attitude_of(log_weights: Array, members: Any) -> Gaussian:
     """Return the attitude of mixtures ``(methods, M)`` of the members."""
     phi = LAYOUT.phi
     each = Gaussian(members.x.dcm, members.P[:, phi, phi])
@@ -229,7 +229,7 @@ def _panel_record(names: tuple[str, ...], models: int) -> Any:
         del info
         log_weights = jnp.stack([state.log_weights[name] for name in names])
         weights = jnp.exp(jnp.stack([state.log_weights[name] for name in banks]))
-        return _Seen(_attitude(log_weights, state.members), weights[:, :models])
+        return _Seen(attitude_of(log_weights, state.members), weights[:, :models])
 
     return record
 
@@ -237,7 +237,7 @@ def _panel_record(names: tuple[str, ...], models: int) -> Any:
 def _imm_record(state: Any, info: Any) -> _Seen:
     del info
     one = state.log_weights[None]
-    return _Seen(_attitude(one, state.members), jnp.exp(one))
+    return _Seen(attitude_of(one, state.members), jnp.exp(one))
 
 
 @cache

@@ -1,0 +1,401 @@
+"""Gradients of every filter and bank, over ten steps and ten thousand, and at singular points."""
+
+import ast
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import scipy.optimize
+from jax import Array
+from jax.test_util import check_grads
+
+import jaxnav
+from jaxnav.estimation.banks.imm import uniform_switching
+from jaxnav.estimation.banks.mixture import BankParams
+from jaxnav.estimation.banks.weights import Penalty, WindowedReset
+from jaxnav.estimation.filters import sigma_point, square_root
+from jaxnav.estimation.filters.adaptive import Adaptation
+from jaxnav.estimation.filters.kalman import kf
+from jaxnav.estimation.filters.line_search import Search
+from jaxnav.estimation.filters.robust import Correntropy, Versoria
+from jaxnav.estimation.filters.sage_husa import SageHusa
+from jaxnav.estimation.run import run
+from jaxnav.estimation.tune.fit import fit, fit_lbfgs
+from jaxnav.estimation.tune.inspect import fisher
+from jaxnav.estimation.tune.losses import negative_log_likelihood
+from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs, replicate
+from jaxnav.navigation.atmosphere import refraction_angle
+from jaxnav.navigation.limb import ray_height, separation
+from jaxnav.navigation.sensors.allan import safe_sqrt
+from jaxnav.navigation.sensors.refraction import raised
+from jaxnav.numerics.linalg import cholesky, tria
+from jaxnav.numerics.sigma import unscented
+from tests.cases import Noise, cases
+from tests.oracles.matrices import central_difference
+
+QUICK = {"xla_backend_optimization_level": 0}
+"""Most of the time is that of the compiler, and the speed of what it makes does not matter."""
+
+
+def oscillator(observe: Callable[[Array], Array]) -> Model:
+    """A damped oscillator of two states that is pushed; its noise is of rank one."""
+    return Model(
+        transition=lambda p, x, u: jnp.stack([x[0] + 0.5 * x[1], 0.8 * x[1] - 0.1 * x[0] + u]),
+        process_noise=lambda p, x, u: p.q * jnp.diag(jnp.array([0.0, 1.0])),
+        observe=lambda p, x, u: observe(x[:1]),
+        observation_noise=lambda p, x, u: p.r * jnp.ones(1),
+    )
+
+
+PARAMS = FilterParams(
+    Noise(jnp.array(1.0), jnp.array(1.0)), Gaussian(jnp.zeros(2), jnp.diag(jnp.array([2.0, 1.0])))
+)
+CASES = cases(oscillator(lambda x: x), PARAMS, 1, oscillator(lambda x: x + 0.3 * jnp.sin(x)))
+each_case = pytest.mark.parametrize("name", CASES)
+
+
+def searched(v: Array) -> Search:
+    """Return a smooth search: a hard one is a decision, across which there is no derivative."""
+    return Search(v[0], v[1], temperature=v[2])
+
+
+UNSCENTED = (0.8,), lambda p, v: p._replace(sigma=unscented(2, alpha=v[0]))
+SEARCH = (0.7, 0.9, 0.5), lambda p, v: p._replace(search=searched(v))
+OWN: dict[str, tuple[tuple[float, ...], Callable[[Any, Array], Any]]] = {
+    "ukf": UNSCENTED,
+    "square_root_ukf": UNSCENTED,
+    "iterated_ekf": (
+        (0.9, 0.5),
+        lambda p, v: p._replace(search=Search(step=v[0], temperature=v[1])),
+    ),
+    "iterated_ckf": SEARCH,
+    "modified_iterated_ckf": SEARCH,
+    "versoria": ((0.1, 2.0), lambda p, v: p._replace(kernel=Versoria(v[0], v[1]))),
+    "correntropy": ((3.0,), lambda p, v: p._replace(kernel=Correntropy(v[0]))),
+    "innovation_adaptive": (
+        (20.0,),
+        lambda p, v: p._replace(adaptation=Adaptation(v[0], 0.01, 100.0)),
+    ),
+    "sage_husa": (
+        (0.95, 5.0),
+        lambda p, v: p._replace(adaptation=SageHusa(v[0], v[1], 0.1, 100.0)),
+    ),
+    "immae, smooth": (
+        (5.0, 0.9, 0.05),
+        lambda p, v: p._replace(rule=((), WindowedReset(v[0], v[1], v[2]))),
+    ),
+    "floor": ((1e-3,), lambda p, v: p._replace(rule=((), v[0]))),
+    "forget": ((0.95,), lambda p, v: p._replace(rule=(v[0], ()))),
+    "markov": ((0.05,), lambda p, v: p._replace(rule=(v[0], ()))),
+    "penalty": (
+        (0.5, 0.15, 9.0, 0.1, 1.0),
+        lambda p, v: p._replace(rule=Penalty(*(v[i] for i in range(5)))),
+    ),
+    "imm": ((0.05,), lambda p, v: p._replace(rule=uniform_switching(3, v[0]))),
+    "mmae of iterated_ckf": (
+        (0.7, 0.9, 0.5),
+        lambda p, v: p._replace(members=p.members._replace(search=replicate(searched(v), 3))),
+    ),
+}
+"""Parameters beside the noise, at which the gradient is taken, and how they enter."""
+
+
+class Data(NamedTuple):
+    """The push at each step and what was observed."""
+
+    inputs: Array
+    observations: Obs
+
+
+def data(steps: int) -> Data:
+    """Draw a run of the oscillator that is observed bent, a fifth of it missing."""
+    rng = np.random.default_rng(12)
+    push, v = rng.normal(size=(2, steps))
+    w, x, z = 1.5 * rng.normal(size=steps), np.zeros(2), np.zeros((steps, 1))
+    for k in range(steps):
+        x = np.array([x[0] + 0.5 * x[1], 0.8 * x[1] - 0.1 * x[0] + push[k] + w[k]])
+        z[k] = x[0] + 0.15 * np.sin(x[0]) + v[k]
+    return Data(jnp.array(push), Obs(jnp.array(z), jnp.array(rng.uniform(size=(steps, 1)) > 0.2)))
+
+
+def log_factors(name: str, steps: int, segment: int = 0) -> Callable[[Array], Array]:
+    """Return the loss of a case by the logarithms of factors on its noise and own parameters."""
+    filter, params, _ = CASES[name]
+    own, enter = OWN.get(name, ((), lambda p, v: p))
+    inputs, observations = data(steps)
+
+    def loss(theta: Array) -> Array:
+        factors = jnp.exp(theta)
+        moved = enter(params, jnp.array(own) * factors[2:])
+        inner = moved.members if isinstance(moved, BankParams) else moved
+        noise = Noise(inner.model.q * factors[0], inner.model.r * factors[1])
+        inner = inner._replace(model=noise)
+        moved = moved._replace(members=inner) if isinstance(moved, BankParams) else inner
+        return negative_log_likelihood(filter, moved, inputs, observations, segment=segment)
+
+    return loss
+
+
+def start(name: str) -> np.ndarray:
+    return np.append([0.1, -0.2], np.zeros(len(OWN.get(name, ((),))[0])))
+
+
+@each_case
+def test_gradient_over_ten_steps(name: str) -> None:
+    """Backward and forward, by the noise and by every parameter of the case's own."""
+    loss, point = log_factors(name, 10), start(name)
+    ahead = np.linspace(1.0, 0.5, point.size)
+
+    def forward(theta: Array) -> tuple[Array, Array]:
+        return jax.jvp(loss, (theta,), (jnp.array(ahead),))
+
+    both = jax.jit(forward, compiler_options=QUICK)
+    gradient = np.asarray(jax.jit(jax.grad(loss), compiler_options=QUICK)(point))
+    expected = [
+        central_difference(lambda t: np.asarray(both(t)[0]), point, e, 1e-3)
+        for e in np.eye(point.size)
+    ]
+    np.testing.assert_allclose(gradient, expected, rtol=1e-8, atol=1e-11)
+    np.testing.assert_allclose(both(point)[1], gradient @ ahead, rtol=1e-12, atol=1e-13)
+    assert np.all(np.abs(gradient[:2]) > 1e-6)
+
+
+@pytest.mark.slow
+@each_case
+def test_check_grads_over_ten_steps(name: str) -> None:
+    """By JAX's own test, which compiles four programs where the one above compiles two."""
+    loss = jax.jit(log_factors(name, 10))
+    check_grads(loss, (start(name),), 1, modes=["fwd", "rev"], atol=1e-8, rtol=1e-6, eps=1e-4)
+
+
+@pytest.mark.slow
+@each_case
+def test_gradient_over_ten_thousand_steps(name: str) -> None:
+    """By the noise together they neither vanish nor explode.
+
+    A filter that estimates a noise cancels the factor on it: that entry alone is small. The step is
+    short as the loss of a hard reset is in pieces, about a thousandth of a logarithm long, that are
+    1e-4 apart: the gradient is that of a piece.
+    """
+    both = jax.jit(jax.value_and_grad(log_factors(name, 10_000, segment=100)))
+    point, h = start(name), 1e-6
+    expected = np.array(
+        [(both(point + h * e)[0] - both(point - h * e)[0]) / (2 * h) for e in np.eye(point.size)]
+    )
+    gradient = np.asarray(both(point)[1])
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-9)
+    assert 1e-2 < np.abs(gradient[:2]).max() < 10
+
+
+# Singular points
+
+AXIS = jnp.array([0.0, 0.0, 1.0])
+ABOVE = jnp.array([0.0, 0.0, 7e6])
+SINGULAR: dict[str, tuple[Callable[[Array], Array], Array]] = {
+    "root of zero": (safe_sqrt, jnp.array(0.0)),
+    "root of a negative number": (safe_sqrt, jnp.array(-1.0)),
+    "angle between opposite directions": (lambda b: separation(AXIS, b), -AXIS),
+    "star at the zenith, turned": (lambda s: jnp.sum(raised(ABOVE, s, jnp.array(0.1))), AXIS),
+    "star at the nadir, turned": (lambda s: jnp.sum(raised(ABOVE, s, jnp.array(0.1))), -AXIS),
+    "ray to the zenith": (lambda s: ray_height(ABOVE, s, 1e-3), AXIS),
+    "refraction at a kink of the air": (refraction_angle, jnp.array(20e3)),
+    "factor of a singular matrix": (
+        lambda S: jnp.sum(cholesky(S).factor),
+        jnp.diag(jnp.array([1.0, 0.0])),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SINGULAR)
+def test_value_and_gradient_are_finite_at_a_singular_point(name: str) -> None:
+    """Of roots, norms, angles and factors, where the plain functions give infinity or NaN."""
+    function, point = SINGULAR[name]
+    value, gradient = jax.jit(jax.value_and_grad(function), compiler_options=QUICK)(point)
+    assert np.isfinite(value)
+    assert np.all(np.isfinite(gradient))
+
+
+DECOMPOSITIONS = {"eig", "eigh", "eigvals", "eigvalsh", "svd", "svdvals", "sqrtm", "pinv", "lstsq"}
+
+
+def test_no_decomposition_without_a_derivative_is_on_a_differentiated_path() -> None:
+    """Their derivatives are NaN at repeated values; the one that is left is of a host's array."""
+    root, found = Path(jaxnav.__file__).parent, set()
+    for folder in ("numerics", "estimation", "navigation"):
+        for path in sorted((root / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Attribute) and node.attr in DECOMPOSITIONS:
+                    found.add((path.relative_to(root).as_posix(), ast.unparse(node)))
+    assert found == {("estimation/tune/inspect.py", "np.linalg.eigvalsh")}
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name.startswith("square_root")])
+def test_arrays_given_to_qr_are_tall_and_of_full_rank(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With process noise of rank one. The transpose is factored, so what is given is wide."""
+    given = []
+
+    def recorded(A: Array) -> Array:
+        jax.debug.callback(lambda A: given.append(np.asarray(A)), A)
+        return tria(A)
+
+    for module in (square_root, sigma_point):
+        monkeypatch.setattr(module, "tria", recorded)
+    filter, params, _ = cases(oscillator(lambda x: x), PARAMS, 1)[name]
+
+    @partial(jax.jit, compiler_options=QUICK)
+    def step(z: Array) -> Any:
+        state = filter.predict(params, filter.init(params), jnp.array(0.5))
+        return filter.update(params, state, jnp.array(0.5), Obs(z, jnp.ones(1, bool)))
+
+    jax.block_until_ready(step(jnp.ones(1)))
+    jax.effects_barrier()
+    assert len(given) == 2
+    for A in given:
+        assert A.shape[1] >= A.shape[0]
+        assert np.linalg.svd(A, compute_uv=False).min() > 1e-3
+
+
+# The optimiser
+
+
+def variance_loss(variance: Array) -> Array:
+    """The negative log-likelihood of data whose mean square is 2."""
+    return 0.5 * jnp.log(variance) + 1.0 / variance
+
+
+@pytest.mark.parametrize("begin", [1e-12, 1e12])
+def test_fit_from_twelve_decades_away(begin: float) -> None:
+    """The gradient there is 1e12 or flat in the number itself; in its logarithm a way is open."""
+    rate = optax.cosine_decay_schedule(1.0, 200)
+    steady = optax.chain(optax.clip(0.5), optax.adam(rate))
+    found = fit(variance_loss, begin, optimiser=steady, steps=200)
+    np.testing.assert_allclose(found.params, 2.0, rtol=1e-3)
+    found = fit_lbfgs(variance_loss, begin, steps=200)
+    np.testing.assert_allclose(found.params, 2.0, rtol=1e-5)
+    by_default = fit(variance_loss, begin)
+    assert np.isfinite(by_default.params)
+    assert by_default.loss < variance_loss(jnp.array(begin))
+
+
+def test_fit_with_a_rate_of_ten_stays_finite_and_keeps_the_best() -> None:
+    found = fit(variance_loss, 3.0, optimiser=optax.adam(10.0), steps=30)
+    assert np.isfinite(found.params)
+    assert found.loss == np.nanmin(found.history)
+    assert found.loss <= variance_loss(jnp.array(3.0))
+
+
+def test_loss_that_is_not_a_number_at_one_step_keeps_the_parameters() -> None:
+    def broken(variance: Array, bad: Array) -> Array:
+        return jnp.where(bad, jnp.nan, variance_loss(variance))
+
+    def fitted(steps: int, at: int) -> Any:
+        return fit(
+            broken,
+            5.0,
+            optimiser=optax.adam(0.1),
+            steps=steps,
+            batches=lambda number: jnp.array(number == at),
+        )
+
+    before, hit, after = fitted(6, 99), fitted(7, 7), fitted(8, 7)
+    assert hit.params == before.params
+    assert hit.rejected == 1
+    assert np.isnan(hit.history[7])
+    assert np.isfinite(after.history[8])
+    assert after.loss < before.loss
+
+
+def test_a_wall_of_nan_never_replaces_the_best() -> None:
+    """The minimum lies on the edge of where the loss is a number."""
+
+    def walled(x: Array) -> Array:
+        return jnp.where(x < 2.0, jnp.nan, variance_loss(x) + x)
+
+    for found in (fit(walled, 9.0, optimiser=optax.sgd(10.0)), fit_lbfgs(walled, 9.0)):
+        assert found.rejected > 0
+        assert found.params >= 2.0
+        assert found.loss == np.nanmin(found.history)
+        assert found.loss < walled(jnp.array(9.0))
+
+
+# Against what is known exactly
+
+
+WALK = Model(
+    transition=lambda p, x, u: x,
+    process_noise=lambda p, x, u: p.q * jnp.ones((1, 1)),
+    observe=lambda p, x, u: x,
+    observation_noise=lambda p, x, u: p.r * jnp.ones(1),
+)
+FROM_ZERO = Gaussian(jnp.zeros(1), jnp.ones((1, 1)))
+
+
+def test_derivative_of_the_steady_covariance_is_that_of_riccati() -> None:
+    """``P = (sqrt(q^2 + 4 q r) - q) / 2`` of a random walk, over ten decades of ``q / r``."""
+    q, r = 10.0 ** np.arange(-5, 6), np.full(11, 2.0)
+    steps = 8000
+    silent = Obs(jnp.zeros((steps, 1)), jnp.ones((steps, 1), bool))
+
+    def steady(q: Array, r: Array) -> Array:
+        params = FilterParams(Noise(q, r), FROM_ZERO)
+        last = run(kf(WALK), params, jnp.zeros(steps), silent, record=lambda s, i: (), segment=100)
+        return last.final.P[0, 0]
+
+    graded = jax.jit(jax.vmap(jax.value_and_grad(steady, (0, 1))), compiler_options=QUICK)
+    P, (by_q, by_r) = graded(q, r)
+    root = np.sqrt(q**2 + 4 * q * r)
+    np.testing.assert_allclose(P, 2 * q * r / (root + q), rtol=1e-12)
+    # ((q + 2 r) / root - 1) / 2 without its cancellation; the filter's is what terms of one leave
+    np.testing.assert_allclose(by_q, 2 * r**2 / (root * (q + 2 * r + root)), rtol=1e-10, atol=1e-16)
+    np.testing.assert_allclose(by_r, q / root, rtol=1e-10)
+
+
+def test_likelihood_and_its_maximum_are_those_of_the_dense_covariance() -> None:
+    """A random walk in white noise: the series is one Gaussian vector, maximised by scipy.
+
+    The standard deviations by the Fisher information are those of its own Hessian.
+    """
+    steps, rng = 80, np.random.default_rng(3)
+    walk = rng.normal() + np.cumsum(0.6 * rng.normal(size=steps))
+    z = walk + 1.3 * rng.normal(size=steps)
+    k = np.arange(1, steps + 1)
+    shared = np.minimum(k[:, None], k[None])
+
+    def dense(log_noise: np.ndarray) -> np.ndarray:
+        q, r = np.exp(log_noise)
+        C = 1.0 + q * shared + r * np.eye(steps)
+        _, log_det = np.linalg.slogdet(2 * np.pi * C)
+        return 0.5 * (log_det + z @ np.linalg.solve(C, z)) / steps
+
+    def loss(noise: Noise) -> Array:
+        observations = Obs(jnp.array(z)[:, None], jnp.ones((steps, 1), bool))
+        params = FilterParams(noise, FROM_ZERO)
+        return negative_log_likelihood(kf(WALK), params, jnp.zeros(steps), observations)
+
+    tight = {"xatol": 1e-9, "fatol": 1e-15, "maxiter": 2000}
+    known = scipy.optimize.minimize(dense, np.zeros(2), method="Nelder-Mead", options=tight)
+    found = fit_lbfgs(loss, Noise(jnp.array(1.0), jnp.array(1.0)))
+    np.testing.assert_allclose(found.history[0], dense(np.zeros(2)), rtol=1e-12)
+    np.testing.assert_allclose(found.loss, known.fun, rtol=1e-9)
+    np.testing.assert_allclose(found.params, np.exp(known.x), rtol=1e-3)
+
+    optimum = Noise(*map(jnp.array, np.exp(known.x)))
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        return np.array([central_difference(dense, x, e, 1e-2) for e in np.eye(2)])
+
+    hessian = [central_difference(slope, known.x, e, 1e-2) for e in np.eye(2)]
+    covariance = np.linalg.inv(steps * np.array(hessian))
+    told = fisher(loss, optimum, steps)
+    np.testing.assert_allclose(told.covariance, covariance, rtol=1e-5)
+    np.testing.assert_allclose(
+        told.sigma, np.exp(known.x) * np.sqrt(np.diag(covariance)), rtol=1e-5
+    )
