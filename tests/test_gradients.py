@@ -359,10 +359,7 @@ def test_derivative_of_the_steady_covariance_is_that_of_riccati() -> None:
 
 
 def test_likelihood_and_its_maximum_are_those_of_the_dense_covariance() -> None:
-    """A random walk in white noise: the series is one Gaussian vector, maximised by scipy.
-
-    The standard deviations by the Fisher information are those of its own Hessian.
-    """
+    """A random walk in white noise is one Gaussian vector; its Hessian gives the Fisher sigmas."""
     steps, rng = 80, np.random.default_rng(3)
     walk = rng.normal() + np.cumsum(0.6 * rng.normal(size=steps))
     z = walk + 1.3 * rng.normal(size=steps)

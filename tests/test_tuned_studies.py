@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -209,10 +210,11 @@ def test_rkcns_loss_falls_against_its_slope() -> None:
 
 
 def test_all_scenarios_at_once_are_refused() -> None:
-    for problem, config in (
+    cases: list[tuple[Any, Any]] = [
         (arekf, ArekfConfig(scenario="all")),
         (mmae_ukf, MmaeUkfConfig(scenario="all")),
         (rkcns, RkcnsConfig(scenario="all")),
-    ):
+    ]
+    for problem, config in cases:
         with pytest.raises(ConfigError, match="scenario is all; it must be one of"):
             problem(config)

@@ -38,11 +38,10 @@ def matmul(A: Array, B: Array) -> Array:
     if inner == 0 or inner > UNROLL_LIMIT:
         return A @ B
     if B.ndim == 1:
-        return sum((A[:, j] * B[j] for j in range(1, inner)), A[:, 0] * B[0])
-    return sum(
-        (A[:, j][:, None] * B[j][None] for j in range(1, inner)),
-        A[:, 0][:, None] * B[0][None],
-    )
+        return matmul(A, B[:, None])[:, 0]
+    # The derivative of a split is one concatenation; that of slices, padded sums, is far slower.
+    columns, rows = jnp.split(A, inner, axis=1), jnp.split(B, inner, axis=0)
+    return sum((columns[j] * rows[j] for j in range(1, inner)), columns[0] * rows[0])
 
 
 def materialised(tree: Any) -> Any:

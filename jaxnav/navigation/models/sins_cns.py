@@ -120,23 +120,15 @@ def sins_cns(period: float, imu_step: float) -> Model:
     Returns:
         A linear model with :class:`SinsCnsParams` and :class:`SinsCnsInput`; three channels.
     """
-    s = LAYOUT
 
     def transition(params: SinsCnsParams, x: Array, u: SinsCnsInput) -> Array:
         del params
-        dv = (
-            matmul(u.minus_force_skew, x[s.phi])
-            + matmul(u.gravity_gradient, x[s.dr])
-            + matmul(u.dcm, x[s.nabla])
+        phi, dv, dr, eps, nabla = jnp.split(x, 5)
+        force = (
+            matmul(u.minus_force_skew, phi) + matmul(u.gravity_gradient, dr) + matmul(u.dcm, nabla)
         )
         return jnp.concatenate(
-            [
-                x[s.phi] + period * matmul(u.dcm, x[s.eps]),
-                x[s.dv] + period * dv,
-                x[s.dr] + period * x[s.dv],
-                x[s.eps],
-                x[s.nabla],
-            ]
+            [phi + period * matmul(u.dcm, eps), dv + period * force, dr + period * dv, eps, nabla]
         )
 
     def process_noise(params: SinsCnsParams, x: Array, u: SinsCnsInput) -> Array:

@@ -75,7 +75,7 @@ def problem(config: ArekfConfig) -> Problem:
         rivals=RIVALS,
         runs=8,
         steps=40,
-        rate=0.2,
+        rate=0.3,
         fresh=True,
         mode="forward",
         notes=(
