@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.types import Flag, Gaussian, Info, Model, Obs
-from jaxnav.numerics.linalg import Cholesky, log_det_positive, squared_norm
+from jaxnav.numerics.linalg import Cholesky, log_det, log_det_positive, solve_lower, squared_norm
 
 ILL_CONDITIONED_EPS = 1e3
 """Multiple of the machine epsilon below which a Cholesky pivot is called ill-conditioned."""
@@ -92,7 +92,13 @@ def _shapes(shapes: list[tuple[int, ...]]) -> str:
 
 
 def innovation_info(
-    nu: Array, S: Array, root: Cholesky, valid: Array, indefinite: Array | None = None
+    nu: Array,
+    S: Array,
+    root: Cholesky,
+    valid: Array,
+    indefinite: Array | None = None,
+    *,
+    rooted: bool = False,
 ) -> Info:
     """Judge an innovation ``(m,)`` against its covariance ``(m, m)`` and its factor, all masked.
 
@@ -102,11 +108,17 @@ def innovation_info(
         root: The factor of ``S``.
         valid: ``(m,)`` bool.
         indefinite: Whether a covariance had to be mended in this step.
+        rooted: Whether the factor was computed and ``S`` is its square, which has half the digits:
+            the derivative is then taken through the factor, else through ``S`` at less cost.
     """
     usable = root.positive_definite
-    nis = jnp.where(usable, squared_norm(root.factor, S, nu), 0)
+    if rooted:
+        whitened = solve_lower(root.factor, nu)
+        squared, volume = jnp.sum(whitened * whitened), log_det(root.factor)
+    else:
+        squared, volume = squared_norm(root.factor, S, nu), log_det_positive(root.factor, S)
+    nis = jnp.where(usable, squared, 0)
     channels = jnp.sum(valid).astype(S.dtype)
-    volume = log_det_positive(root.factor, S)
     log_likelihood = -0.5 * (nis + volume + channels * math.log(2 * math.pi))
     few_digits = root.reciprocal_pivot < ILL_CONDITIONED_EPS * jnp.finfo(S.dtype).eps
     raised = {

@@ -289,7 +289,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         done = read_array(triangle, m, state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         indefinite = state.indefinite | ~sound
-        info = innovation_info(nu, done.S, done.root, obs.valid, indefinite)
+        info = innovation_info(nu, done.S, done.root, obs.valid, indefinite, rooted=True)
         return SquareRootSigmaPointState(x, done.L, jnp.zeros_like(indefinite)), info
 
     def estimate(state: SquareRootSigmaPointState) -> Gaussian:

@@ -105,7 +105,8 @@ def square_root_ekf(model: Model) -> Filter:
         HL = jnp.where(obs.valid[:, None], push(state.L), 0)
         done = read_array(tria(update_array(R, HL, state.L)), HL.shape[0], state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
-        return SquareRootState(x, done.L), innovation_info(nu, done.S, done.root, obs.valid)
+        info = innovation_info(nu, done.S, done.root, obs.valid, rooted=True)
+        return SquareRootState(x, done.L), info
 
     def estimate(state: SquareRootState) -> Gaussian:
         return Gaussian(state.x, state.L @ state.L.T)
