@@ -50,7 +50,7 @@ def problem(config: RkcnsConfig) -> Problem:
     """Return the tuning of the modified iterated filter: the noise it believes, its longest step.
 
     It trains by the RMSE of the position over whole flights, with a smooth line search: a gradient
-    of eight flights takes GRADIENT_S s on one core. The hand-set noise is the true one. Nothing
+    of eight flights takes 3.5 s on one core, forwards. The hand-set noise is the true one. Nothing
     varies within a flight that could be learned by heart: the errors of launch, sensors and, in
     "strong-nonlinearity", the lost position are drawn for each.
 
@@ -75,7 +75,7 @@ def problem(config: RkcnsConfig) -> Problem:
         measure=Measure("mean-square", "position RMSE, norm over three axes", "m"),
         rivals=("tuned, hard rule", *RIVALS),
         runs=8,
-        steps=40,
+        steps=25,
         rate=0.1,
         fresh=True,
         mode="forward",
