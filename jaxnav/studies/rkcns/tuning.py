@@ -24,7 +24,7 @@ from jaxnav.studies.tuned import Measure, Parameter, Problem, Values
 from jaxnav.units import ARCSEC
 
 METHOD = "modified-iterated-ckf"
-RIVALS = {"hand-set": METHOD, "ckf": "ckf", "iterated-ckf": "iterated-ckf", "oracle": "oracle"}
+RIVALS = {"hand-set": METHOD, "ckf": "ckf", "oracle": "oracle"}
 """Methods of the study that the optimum is compared with, by what they are called here."""
 TEMPERATURE = 1.0
 """Of the smooth line search, in units of its functional: that of one squared standard deviation."""
