@@ -67,6 +67,12 @@ def safe_norm(x: Array) -> Array:
     return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1)), 0)
 
 
+def safe_sqrt(x: Array) -> Array:
+    """Return the square root, with a zero derivative instead of an infinite one at zero."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
 class Cholesky(NamedTuple):
     """Lower Cholesky factor ``L L' = S`` with the health of the factorisation.
 

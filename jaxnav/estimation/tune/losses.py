@@ -14,6 +14,7 @@ from jax import Array
 from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, Gaussian, Info, Input, Obs, Params
+from jaxnav.numerics.linalg import safe_sqrt
 
 
 class Term(NamedTuple):
@@ -47,7 +48,7 @@ def rmse(error: ErrorOf) -> Term:
         del info
         return jnp.sum(error(estimate, truth).mean ** 2)[None]
 
-    return Term(step, lambda mean: jnp.sqrt(mean[0]))
+    return Term(step, lambda mean: safe_sqrt(mean[0]))
 
 
 def nis_consistency() -> Term:
@@ -63,7 +64,11 @@ def nis_consistency() -> Term:
         channels = jnp.sum(info.innovation != 0).astype(info.nis.dtype)
         return jnp.stack([info.nis, channels])
 
-    return Term(step, lambda mean: jnp.log(mean[0] / mean[1]) ** 2)
+    def combine(mean: Array) -> Array:
+        nis, channels = jnp.where(mean[1] > 0, mean, 1)
+        return jnp.log(nis / channels) ** 2
+
+    return Term(step, combine)
 
 
 def nees_consistency(error: ErrorOf) -> Term:

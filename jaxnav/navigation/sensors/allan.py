@@ -13,6 +13,8 @@ import numpy as np
 from jax import Array
 from scipy.special import gammaincinv
 
+from jaxnav.numerics.linalg import safe_sqrt
+
 FLICKER = 2 * math.log(2) / math.pi
 """Allan variance of flicker noise of density ``1 / (2 pi f)``, at any cluster time."""
 
@@ -37,12 +39,6 @@ class AllanVariance(NamedTuple):
     def deviation(self) -> Array:
         """Allan deviation ``(M,) [u/s]``, whose derivative at zero is zero."""
         return safe_sqrt(self.variance)
-
-
-def safe_sqrt(x: Array) -> Array:
-    """Return the square root, with a zero derivative instead of an infinite one at zero."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
 def cluster_sizes(count: int, per_octave: int = 1, longest: float = 1 / 9) -> tuple[int, ...]:

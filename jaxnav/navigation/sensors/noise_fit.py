@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxnav.navigation.sensors.allan import FLICKER, AllanVariance, chi_square_ends, safe_sqrt
+from jaxnav.navigation.sensors.allan import FLICKER, AllanVariance, chi_square_ends
 from jaxnav.navigation.sensors.imu import NoiseModel
-from jaxnav.numerics.linalg import cholesky, solve_lower, solve_lower_transposed
+from jaxnav.numerics.linalg import cholesky, safe_sqrt, solve_lower, solve_lower_transposed
 
 ITERATIONS = 10
 """Times the weights are formed anew from the fitted noise."""
