@@ -73,8 +73,8 @@ def problem(config: MmaeUkfConfig) -> Problem:
 
     It trains on the first :data:`TRAINING_S` of a flight, each flight with three spans and levels
     of noise of its own, by the RMSE of the attitude where the study scores it: a gradient of four
-    such flights takes 5.6 s on one core, and whole flights ten times that. It is judged on flights
-    of the study's length with the study's noise, 1.6 s each on two cores.
+    such flights takes 5.6 s on one core, and one of whole flights would take ten times that. It is
+    judged on flights of the length and the noise of the study.
 
     Raises:
         ConfigError: If the scenario is "all".
