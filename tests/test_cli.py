@@ -33,7 +33,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 BAD = {
-    "unknown command": (("fly",), ("'fly'", "list, run, filter, allan, doctor")),
+    "unknown command": (("fly",), ("'fly'", "list, run, tune, filter, allan, doctor")),
     "unknown study": (
         ("run", "imae"),
         ("'imae'", "immae, mmae-ukf, rkcns, arekf, sage-husa, gnss-track"),
