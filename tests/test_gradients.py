@@ -181,10 +181,10 @@ def test_gradient_over_ten_thousand_steps(name: str) -> None:
     point, h = start(name), 1e-6 if name in HARD else 1e-4
     loss = log_factors(name, 10_000, segment=100)
     both = jax.jit(jax.vmap(jax.value_and_grad(loss)), compiler_options=QUICK)
-    moves = h * np.array([2, 1, -1, -2])[:, None, None] * np.eye(point.size)
+    moves = h * np.array([1, -1])[:, None, None] * np.eye(point.size)
     values, gradients = both(np.concatenate([point[None], *(point + moves)]))
-    ends = np.reshape(values[1:], (4, point.size))
-    expected = (8 * (ends[1] - ends[2]) - (ends[0] - ends[3])) / (12 * h)
+    above, below = np.reshape(values[1:], (2, point.size))
+    expected = (above - below) / (2 * h)
     np.testing.assert_allclose(gradients[0], expected, rtol=1e-4, atol=1e-9)
     size = np.abs(gradients[0])
     assert np.all(size < 2)
