@@ -90,7 +90,7 @@ def tune(
         held_out[label] = judge(found.params, keys[JUDGE], config.held_out_runs)
         if progress is not None:
             progress("held out", number, len(problem.held_out))
-    profiled = _profiled(found.params, chosen, losses, config)
+    profiled, missing = _profiled(found.params, chosen, losses, config)
     known, unknown = _uncertainty(problem, found.params, chosen, losses, config)
     document = {
         "schema": SCHEMA,
@@ -108,7 +108,7 @@ def tune(
             label: _verdict(scores, problem.measure, problem.rivals)
             for label, scores in held_out.items()
         },
-        "notes": [*problem.notes, *unknown, *_warnings(found, checked)],
+        "notes": [*problem.notes, *missing, *unknown, *_warnings(found, checked)],
     }
     return Report(document, _arrays(found, profiled, held_out), found, profiled)
 
@@ -186,16 +186,21 @@ def _descend(
 
 def _profiled(
     values: Any, chosen: Selection, losses: _Losses, config: TuneConfig
-) -> Profile | None:
+) -> tuple[Profile | None, list[str]]:
+    """Return the profiles about an optimum, or why there are none: it may be at a domain's end."""
     if not config.profile_points:
-        return None
-    return profile(
-        losses.smooth,
-        values,
-        data=(losses.data,),
-        transform=chosen.transforms,
-        points=config.profile_points,
-    )
+        return None, []
+    try:
+        drawn = profile(
+            losses.smooth,
+            values,
+            data=(losses.data,),
+            transform=chosen.transforms,
+            points=config.profile_points,
+        )
+    except ValueError as error:
+        return None, [f"no profiles of the loss: {error}"]
+    return drawn, []
 
 
 def _uncertainty(
