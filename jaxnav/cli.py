@@ -184,7 +184,7 @@ def _tune(rest: list[str]) -> int:
 def _log_problem(path: str, config: Any) -> Any:
     from jaxnav.datasets.formats import load_drive
     from jaxnav.recorded.config import check
-    from jaxnav.recorded.tuned import problem
+    from jaxnav.recorded.tuning import problem
 
     check(config)
     return problem(load_drive(Path(path)), config)

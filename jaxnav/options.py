@@ -66,12 +66,14 @@ def parse_tune(name: str, study: type, arguments: list[str]) -> Options | None:
     Args:
         name: What stands for the study in the usage.
         study: The configuration class that the tuning starts from: every field is a flag that
-            begins with ``--study.``.
+            begins with ``--study.``, and of a recorded log ``--study.config`` is a file of them.
         arguments: The arguments after the study's name.
     """
     files = "summary.json, tuning.npz and the figures"
     program, out = f"jaxnav tune {name}", Path("results") / "tune" / name.lower()
-    return _parse(program, TuneConfig, out, files, arguments, study=study)
+    path = _value_of("--study.config", arguments) if study is FilterConfig else None
+    given = study() if path is None else from_toml(Path(path))
+    return _parse(program, TuneConfig, out, files, arguments, study=given)
 
 
 def _value_of(flag: str, arguments: list[str]) -> str | None:
@@ -92,9 +94,12 @@ def _parse(
     files: str,
     arguments: list[str],
     default: Any = None,
-    study: type | None = None,
+    study: Any = None,
 ) -> Options | None:
-    """Parse the fields of a configuration, ``--out`` and ``--json``, and those of a study."""
+    """Parse the fields of a configuration, ``--out`` and ``--json``, and those of a study.
+
+    ``default`` and ``study`` hold the values where no flag is given.
+    """
     given = config() if default is None else default
     parts: list[Any] = [
         ("config", tyro.conf.OmitArgPrefixes[config], field(default=given)),
@@ -102,7 +107,7 @@ def _parse(
         ("json", bool, field(default=False)),
     ]
     if study is not None:
-        parts.append(("study", study, field(default=study())))
+        parts.append(("study", type(study), field(default=study)))
     options = make_dataclass("Options", parts, frozen=True)
     options.__doc__ = (
         f"{(config.__doc__ or program).splitlines()[0]}\n\n"

@@ -103,6 +103,25 @@ def test_bad_input_is_one_sentence(
     assert not list(tmp_path.rglob("summary.json"))
 
 
+@recorded
+def test_a_drive_is_tuned_from_its_configuration_file(tmp_path: Path) -> None:
+    """The noise of the receiver alone; what the file says is where it starts."""
+    file = tmp_path / "bank.toml"
+    file.write_text("gyro_noise_dps = 0.2\nr_factors = [3.0]\nnoise_rate_hz = 5.0\n")
+    options = ("--study.config", str(file), "--params", "r_factors", "--steps", "8")
+    rest = ("--profile-points", "0", "--out", str(tmp_path), "--json")
+    assert main(["tune", str(LOG.parent), *options, *rest]) == OK
+    document = json.loads((tmp_path / "summary.json").read_text())
+    found = document["parameters"]
+    assert found["gyro_noise_dps"]["tuned"] == 0.2
+    assert found["r_factors"]["start"] == [3.0]
+    assert 0.1 < found["r_factors"]["tuned"][0] < 2.0
+    assert 0 < found["r_factors"]["sigma"][0] < 0.2
+    assert document["loss"]["tuned"] < document["loss"]["start"]
+    (verdict,) = document["held_out"].values()
+    assert verdict["methods"]["tuned"]["value"] > verdict["methods"]["hand-set"]["value"]
+
+
 def test_what_is_neither_study_nor_log(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tune", "no-such-thing"]) == BAD_INPUT
     assert "no study or log 'no-such-thing'; it must be a recorded" in capsys.readouterr().err
@@ -122,7 +141,6 @@ def test_a_loss_that_starts_non_finite_is_named() -> None:
         hard=None,
         held_out={},
         measure=Measure("mean", "nothing", "1"),
-        rivals=(),
     )
     for optimiser in ("adam", "lbfgs"):
         with pytest.raises(ConfigError, match="the loss nan or its gradient is not finite at"):

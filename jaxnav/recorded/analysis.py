@@ -20,6 +20,7 @@ from jaxnav.recorded.experiments import (
     single_model,
 )
 from jaxnav.recorded.methods import Kept, Method, filter_params, member_names, method
+from jaxnav.recorded.offset import Offset, likeliest_offset
 from jaxnav.recorded.preparation import Drive, prepare
 from jaxnav.recorded.scoring import (
     ReferenceErrors,
@@ -30,7 +31,6 @@ from jaxnav.recorded.scoring import (
     mounting,
     rms,
 )
-from jaxnav.recorded.tuning import Offset, likeliest_offset
 from jaxnav.results import SCHEMA, provenance
 from jaxnav.studies.base import plain
 from jaxnav.units import DEG

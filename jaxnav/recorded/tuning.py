@@ -1,4 +1,4 @@
-"""The likeliest time offset between the receiver and the inertial sensors."""
+"""The noise of a recorded drive's filter, to be tuned by the likelihood of its fixes."""
 
 from dataclasses import replace
 from functools import partial
@@ -6,86 +6,152 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxnav.datasets.drive import DriveLog
-from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, FilterParams, Info, Obs
-from jaxnav.navigation.models.level_errors import error_form
-from jaxnav.navigation.models.vehicle import FIXES, vehicle
-from jaxnav.numerics.linalg import cholesky, solve_lower
-from jaxnav.recorded.config import FilterConfig
-from jaxnav.recorded.methods import filter_params
-from jaxnav.recorded.preparation import prepare
+from jaxnav.estimation.tune.losses import negative_log_likelihood
+from jaxnav.estimation.tune.transforms import POSITIVE, UNIT, between
+from jaxnav.estimation.types import Filter, Info, Obs
+from jaxnav.navigation.models.vehicle import FIXES
+from jaxnav.recorded.config import FilterConfig, members
+from jaxnav.recorded.methods import filter_params, method
+from jaxnav.recorded.offset import likeliest_offset
+from jaxnav.recorded.preparation import Drive, prepare
+from jaxnav.studies.base import ConfigError
+from jaxnav.studies.tuned import Measure, Parameter, Problem, Values
 
-STEPS = 6
-CLOSE_S = 5e-4
-"""A step below half a millisecond ends the search."""
-LARGEST_STEP_S = 0.2
-"""The first order in the offset is good for less than that; a step back is half of that before."""
-
-
-class Offset(NamedTuple):
-    """The likeliest offset [s], its standard deviation [s], and whether the search ended there."""
-
-    value_s: float
-    sigma_s: float
-    found: bool
+BLOCK_S = 30.0
+"""Length of the blocks whose mean log-likelihoods are the samples of the verdict: their errors
+depend on each other little, those of neighbouring fixes very much."""
+LEAST_BLOCKS = 4
 
 
-def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
-    """Return the offset that makes the fixes likeliest, by Gauss-Newton steps.
+class Half(NamedTuple):
+    """A part of the drive as the filter sees it: the receiver's channels alone."""
 
-    The derivative of the log-likelihood is that of a filter of receiver and inertial sensors by
-    the model's own offset; after each step the fixes are moved by it exactly.
+    inputs: Any
+    observations: Obs
 
-        step = sum(dl/dt) / sum(dnu/dt' inv(S) dnu/dt)
 
-    The standard deviation is the inverse root of the denominator: of an ideal filter, and so too
-    small where other errors act like an offset.
+def problem(log: DriveLog, config: FilterConfig) -> Problem:
+    """Return the tuning of a drive's filter or bank: fit on the first half, judged on the second.
 
-    Args:
-        log: The drive.
-        config: The configuration; the search starts from its offset.
+    The loss is the negative log-likelihood of the fixes. The constraints take no part: what they
+    observe is not measured, so that its likelihood says nothing. The filter runs at
+    ``noise_rate_hz``; parameters have the names of the configuration, so that they can be given
+    back to ``jaxnav filter``.
+
+    Raises:
+        ConfigError: If the drive is too short to be judged on its second half.
     """
-    plain = replace(config, filter="ekf", constraints=False, r_factors=(1.0,), q_factors=(1.0,))
-    filter = ekf(vehicle(constrained=False))
-    value, sigma, step = config.time_offset_s, float("nan"), 0.0
-    for _ in range(STEPS):
-        drive = prepare(log, replace(plain, time_offset_s=value), config.noise_rate_hz)
-        form = error_form("additive", drive.initial.mean.position)
-        params = filter_params(plain, drive, log.lever_arm, form)
-        # Whole hundreds of periods, so that a start moved by one does not compile anew.
-        whole = slice(len(drive.time) // 100 * 100 or None)
-        inputs = jax.tree.map(lambda leaf, whole=whole: leaf[whole], drive.inputs)
-        obs = Obs(*(leaf[whole, FIXES] for leaf in drive.observations))
-        slope, information = _score(filter, params, inputs, obs)
-        sigma = float(information) ** -0.5
-        newton, limit = float(slope / information), LARGEST_STEP_S
-        if newton * step < 0:
-            limit = 0.5 * abs(step)
-        step = max(-limit, min(limit, newton))
-        value += step
-        if abs(step) < CLOSE_S:
-            break
-    return Offset(value, sigma, abs(step) < CLOSE_S)
+    plain = replace(config, constraints=False)
+    if config.tune_offset:
+        plain = replace(plain, time_offset_s=likeliest_offset(log, config).value_s)
+    drive = prepare(log, plain, config.noise_rate_hz)
+    half = len(drive.time) // 2
+    block = round(BLOCK_S * config.noise_rate_hz)
+    if half < LEAST_BLOCKS * block:
+        raise ConfigError(
+            f"the drive has {len(drive.time) / config.noise_rate_hz:.0f} s; to be judged on its "
+            f"second half it must have at least {2 * LEAST_BLOCKS * BLOCK_S:.0f} s"
+        )
+    chosen = method(plain, drive.initial.mean.position, constrained=False)
+    whole = _whole(drive)
+    first = jax.tree.map(lambda leaf: leaf[:half], whole)
+    params_of = partial(_params, plain, drive, log, chosen.form)
+    likelihood = jax.jit(partial(_blocks, chosen.filter, half, block))
+
+    def loss(values: Values, part: Half) -> Array:
+        return negative_log_likelihood(
+            chosen.filter, params_of(values), *part, segment=max(1, round(half**0.5))
+        )
+
+    def judge(values: Values, key: Array, runs: int) -> dict[str, np.ndarray]:
+        del key, runs
+        hand_set = {name: jnp.asarray(entry.start) for name, entry in parameters.items()}
+        return {
+            name: np.asarray(likelihood(params_of(of), whole)) * config.noise_rate_hz
+            for name, of in (("tuned", values), ("hand-set", hand_set))
+        }
+
+    parameters = _parameters(plain)
+    return Problem(
+        parameters=parameters,
+        draw=lambda key, runs: first,
+        loss=loss,
+        hard=None,
+        held_out={"second half of the drive": judge},
+        measure=Measure(
+            "mean",
+            "log-likelihood of the fixes, the larger the better",
+            "nats/s",
+            per=f"blocks of {BLOCK_S:g} s",
+        ),
+        samples=half,
+        steps=80,
+        optimiser="lbfgs",
+        simulated=False,
+        mode="forward",
+        notes=(
+            "fixes of a receiver depend on each other, which makes standard deviations too small",
+        ),
+    )
 
 
-@partial(jax.jit, static_argnums=0)
-def _score(filter: Filter, params: FilterParams, inputs: Any, obs: Obs) -> tuple[Array, Array]:
-    """Return the derivative of the log-likelihood by the offset, and its information."""
+def _whole(drive: Drive) -> Half:
+    observations = Obs(*(jnp.asarray(leaf)[:, FIXES] for leaf in drive.observations))
+    return Half(drive.inputs, observations)
 
-    def record(state: Any, info: Info) -> Any:
+
+def _parameters(config: FilterConfig) -> dict[str, Parameter]:
+    found = {
+        "gyro_noise_dps": "noise density of the gyros [deg/s/sqrt(Hz)]",
+        "accel_noise_ug": "noise density of the accelerometers [ug/sqrt(Hz)]",
+        "gyro_walk_dps": "random walk of the gyro drift [deg/s/sqrt(s)]",
+        "accel_walk_ug": "random walk of the accelerometer bias [ug/sqrt(s)]",
+        "r_factors": "factors on the variances of the receiver",
+    }
+    parameters = {
+        name: Parameter(_start(config, name), POSITIVE, text) for name, text in found.items()
+    }
+    if len(config.q_factors) > 1:
+        text = "factors on the process noise; their scale is that of the densities"
+        parameters["q_factors"] = Parameter(_start(config, "q_factors"), POSITIVE, text)
+    if config.filter == "sage-husa-ekf":
+        parameters["forgetting"] = Parameter(
+            _start(config, "forgetting"), UNIT, "forgetting factors"
+        )
+    if members(config) > 1 and config.rule in ("forget", "markov"):
+        text = "time in which evidence fades, or between switches [s]"
+        parameters["rule_time_s"] = Parameter(config.rule_time_s, POSITIVE, text)
+    if members(config) > 1 and config.rule == "floor":
+        below = between(0.0, 1 / members(config))
+        parameters["weight_floor"] = Parameter(config.weight_floor, below, "least weight")
+    return parameters
+
+
+def _start(config: FilterConfig, name: str) -> Any:
+    return jnp.asarray(getattr(config, name), float)
+
+
+def _params(config: FilterConfig, drive: Drive, log: DriveLog, form: Any, values: Values) -> Any:
+    """Return the filter's parameters at values by the names of the configuration."""
+    given = {
+        name: tuple(value) if isinstance(getattr(config, name), tuple) else value
+        for name, value in values.items()
+    }
+    return filter_params(replace(config, **given), drive, log.lever_arm, form)
+
+
+def _blocks(filter: Filter, start: int, block: int, params: Any, whole: Half) -> Array:
+    """Return the mean log-likelihood per step of each block from a step on."""
+
+    def likelihood(state: Any, info: Info) -> Array:
         del state
-        return info.log_likelihood, info.innovation, info.innovation_cov
+        return info.log_likelihood
 
-    def followed(offset: Array) -> Any:
-        own = params._replace(model=params.model._replace(time_offset=offset))
-        return run(filter, own, inputs, obs, record=record).record
-
-    zero = jnp.zeros(())
-    (_, _, S), (slope, moved, _) = jax.jvp(followed, (zero,), (jnp.ones(()),))
-    root = jax.vmap(lambda S: cholesky(S).factor)(S)
-    whitened = jax.vmap(solve_lower)(root, moved)
-    return jnp.sum(slope), jnp.sum(whitened**2)
+    series = run(filter, params, *whole, record=likelihood).record[start:]
+    count = series.shape[0] // block
+    return jnp.mean(series[: count * block].reshape(count, block), axis=1)

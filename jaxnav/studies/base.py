@@ -29,6 +29,12 @@ def require_choice(config: Any, *names: str) -> None:
         require(good, name, value, "one of " + ", ".join(accepted))
 
 
+def require_one_scenario(config: Any, scenarios: Iterable[str]) -> None:
+    """Require that a configuration names one of its study's scenarios, not "all" of them."""
+    names = tuple(scenarios)
+    require(config.scenario in names, "scenario", config.scenario, "one of " + ", ".join(names))
+
+
 def require_positive(config: Any, *names: str) -> None:
     """Require that fields, or all entries of those that are tuples, are positive and finite."""
     for name in names:

@@ -1,7 +1,7 @@
 """What a study offers to be tuned: parameters, simulated data, losses, and how they are judged."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from jax import Array
@@ -32,8 +32,8 @@ class HeldOut(Protocol):
     def __call__(self, values: Values, key: Array, runs: int) -> dict[str, np.ndarray]:
         """Return the measure of each run ``(runs,)``, by method.
 
-        Of "tuned", the rules of the loss at ``values``, and of every rival, all on the same runs;
-        a loss of smooth rules has their hard forms at ``values`` among the rivals.
+        Of "tuned", the rules of the loss at ``values``, and of every method that it is compared
+        with, all on the same runs: "hand-set", and of smooth rules their hard forms at ``values``.
         """
         ...
 
@@ -50,7 +50,7 @@ class Measure(NamedTuple):
         per: What each score is of: runs, or pieces of recorded data.
     """
 
-    kind: str
+    kind: Literal["mean-square", "mean"]
     text: str
     unit: str
     scale: float = 1.0
@@ -67,7 +67,6 @@ class Problem(NamedTuple):
         hard: The same of the hard rules; ``None`` if there is no other.
         held_out: By name, what start and optimum are judged on; the first decides.
         measure: What their scores are.
-        rivals: Methods that the optimum is compared with, the hand-set start among them.
         samples: Number of samples that the mean of a likelihood is over, per run; 0 if the loss is
             no likelihood.
         runs: Training runs in a batch, by default.
@@ -88,7 +87,6 @@ class Problem(NamedTuple):
     hard: Callable[[Values, Any], Array] | None
     held_out: Mapping[str, HeldOut]
     measure: Measure
-    rivals: tuple[str, ...]
     samples: int = 0
     runs: int = 16
     validation_runs: int = 32

@@ -9,7 +9,7 @@ import optax
 from jax import Array
 
 from jaxnav.estimation.metrics import Interval, mean, mean_interval, rmse, rmse_ratio
-from jaxnav.estimation.tune.fit import Fit, Validation, fit, fit_lbfgs
+from jaxnav.estimation.tune.fit import Fit, StartError, Validation, fit, fit_lbfgs
 from jaxnav.estimation.tune.inspect import (
     GradientCheck,
     Profile,
@@ -83,7 +83,7 @@ def tune(
     checked = _checked(problem, chosen, losses, config)
     try:
         found = _descend(problem, chosen, config, keys, losses, progress)
-    except ValueError as error:
+    except StartError as error:
         raise ConfigError(f"{error}; it must be finite where a fit begins") from None
     held_out = {}
     for number, (label, judge) in enumerate(problem.held_out.items(), 1):
@@ -105,8 +105,7 @@ def tune(
         "gradient_check": _gradient(checked),
         "measure": problem.measure._asdict(),
         "held_out": {
-            label: _verdict(scores, problem.measure, problem.rivals)
-            for label, scores in held_out.items()
+            label: _verdict(scores, problem.measure) for label, scores in held_out.items()
         },
         "notes": [*problem.notes, *missing, *unknown, *_warnings(found, checked)],
     }
@@ -156,6 +155,9 @@ def _descend(
         if progress is not None:
             progress("fit", step, total)
 
+    def fresh(number: int) -> Any:
+        return problem.draw(jax.random.fold_in(keys[TRAIN], number), runs)
+
     if (config.optimiser or problem.optimiser) == "lbfgs":
         return fit_lbfgs(
             problem.loss,
@@ -166,18 +168,16 @@ def _descend(
             mode=problem.mode,
             progress=moved,
         )
-    same = None if problem.fresh else problem.draw(keys[TRAIN], runs)
     validation = Validation(losses.smooth, (losses.data,), EVERY, config.patience)
     schedule = optax.cosine_decay_schedule(config.rate or problem.rate, steps)
     return fit(
         problem.loss,
         chosen.start,
+        data=() if problem.fresh else (problem.draw(keys[TRAIN], runs),),
         transform=chosen.transforms,
         optimiser=optax.adam(schedule),
         steps=steps,
-        batches=lambda number: (
-            problem.draw(jax.random.fold_in(keys[TRAIN], number), runs) if same is None else same
-        ),
+        batches=fresh if problem.fresh else None,
         validation=validation if problem.simulated else None,
         mode=problem.mode,
         progress=moved,
@@ -272,16 +272,16 @@ def _gradient(checked: GradientCheck | None) -> dict[str, Any] | None:
     }
 
 
-def _verdict(
-    scores: dict[str, np.ndarray], measure: Measure, rivals: tuple[str, ...]
-) -> dict[str, Any]:
-    """Return each method's measure, and the optimum against each rival, paired over the runs."""
+def _verdict(scores: dict[str, np.ndarray], measure: Measure) -> dict[str, Any]:
+    """Return each method's measure, and the optimum against each other, paired over the runs."""
     tuned = scores["tuned"]
     return {
         "runs": int(tuned.size),
         "methods": {name: _measured(values, measure) for name, values in scores.items()},
         "tuned_over": {
-            rival: compared(tuned, scores[rival], measure)._asdict() for rival in rivals
+            rival: compared(tuned, values, measure)._asdict()
+            for rival, values in scores.items()
+            if rival != "tuned"
         },
     }
 

@@ -48,7 +48,7 @@ def _held_out(document: dict[str, Any], path: Path) -> Path:
     """Draw every method's measure on each held-out set, with its standard error."""
     sets = document["held_out"]
     count = max(len(entry["methods"]) for entry in sets.values())
-    with figure(path, (9, 0.9 + 0.28 * count)) as drawing:
+    with figure(path, (9, 1.3 + 0.28 * count)) as drawing:
         panels = drawing.subplots(1, len(sets), squeeze=False, sharey=True)[0]
         for axes, (label, entry) in zip(panels, sets.items(), strict=True):
             names = list(entry["methods"])
@@ -61,7 +61,8 @@ def _held_out(document: dict[str, Any], path: Path) -> Path:
             axes.invert_yaxis()
             measure = document["measure"]
             axes.set_title(f"{label}, {entry['runs']} {measure['per']}")
-            axes.set_xlabel(f"{measure['text']} [{measure['unit']}], 95 % intervals")
+            axes.set_xlabel(f"[{measure['unit']}], 95 % intervals")
+        drawing.suptitle(document["measure"]["text"], fontsize="medium")
     return path
 
 
@@ -79,6 +80,9 @@ def _profiles(profiled: Profile, path: Path) -> Path:
             axes.plot(value[middle], 0, "o", color="tab:red")
             if np.all(value > 0) and value.max() > 3 * value.min():
                 axes.set_xscale("log")
+                axes.xaxis.set_major_formatter("{x:.3g}")
+                axes.xaxis.set_minor_formatter("")
+                axes.set_xticks(value[:: max(1, middle)])
             axes.set_title(label)
         for axes in list(drawing.axes)[count:]:
             axes.set_visible(False)

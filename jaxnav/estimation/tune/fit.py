@@ -24,7 +24,7 @@ class Fit(NamedTuple):
         loss: The loss that chose them.
         history: ``(steps + 1,)`` the loss at each evaluation; NaN where it was rejected.
         rejected: Number of evaluations whose loss or gradient was not finite.
-        validation: ``(checks, 2)`` step and validation loss of each check.
+        validation: ``(checks, 2)`` step and validation loss of each check, from the start on.
         stopped: What ended the fit: "steps", "patience" or "converged".
     """
 
@@ -52,6 +52,10 @@ class Validation(NamedTuple):
     patience: int = 5
 
 
+class StartError(ValueError):
+    """A fit cannot begin: the loss or its gradient is not finite at the start."""
+
+
 class _Best(NamedTuple):
     point: Array
     loss: float
@@ -62,6 +66,7 @@ def fit(
     loss: Callable[..., Array],
     start: Any,
     *,
+    data: tuple[Any, ...] = (),
     transform: Any = POSITIVE,
     optimiser: optax.GradientTransformation | None = None,
     steps: int = 60,
@@ -76,9 +81,10 @@ def fit(
     half its length; the optimiser never sees it.
 
     Args:
-        loss: ``(params) -> scalar``, or ``(params, batch) -> scalar`` with ``batches``;
+        loss: ``(params, *data) -> scalar``, or ``(params, batch) -> scalar`` with ``batches``;
             differentiable in every parameter that is not fixed.
         start: Pytree of parameters to begin from.
+        data: What the loss is given beside the parameters, at every evaluation the same.
         transform: One :class:`~jaxnav.estimation.tune.transforms.Transform` for all leaves, or a
             pytree of them like ``start``.
         optimiser: The default is Adam, with a rate of 0.1 decaying to zero by a cosine.
@@ -93,11 +99,12 @@ def fit(
         The fit.
 
     Raises:
-        ValueError: If a starting value is outside its domain, or the loss there is not finite.
+        ValueError: If a starting value is outside its domain.
+        StartError: A ``ValueError``, if the loss there is not finite.
     """
     free = coordinates(start, transform)
-    own = None if batches is None else lambda number: (batches(number),)
-    evaluate = _evaluation(loss, free, own or (lambda number: ()), mode)
+    given = (lambda number: data) if batches is None else (lambda number: (batches(number),))
+    evaluate = _evaluation(loss, free, given, mode)
     improve = _improvement(optimiser or optax.adam(optax.cosine_decay_schedule(0.1, steps)))
     check = None if validation is None else _check(validation, free)
 
@@ -106,8 +113,9 @@ def fit(
     _require_start(value, gradient, start)
     memory = improve.init(point)
     update, memory = improve.update(gradient, memory, point)
-    best = _Best(point, float("inf") if check else value, 0)
-    history, rejected, scale, stopped, checks = [value], 0, 1.0, "steps", []
+    checks = [] if check is None else [(0, check(point))]
+    best = _Best(point, checks[0][1] if checks else value, len(checks))
+    history, rejected, scale, stopped = [value], 0, 1.0, "steps"
     for step in range(1, steps + 1):
         candidate = point + scale * update
         value, gradient = evaluate(candidate, step)
@@ -209,7 +217,7 @@ def _check(validation: Validation, free: Coordinates) -> Callable[[Array], float
 
 def _require_start(value: float, gradient: Array, start: Any) -> None:
     if not _finite(value, gradient):
-        raise ValueError(f"the loss {value} or its gradient is not finite at {start}")
+        raise StartError(f"the loss {value} or its gradient is not finite at {start}")
 
 
 def _finite(value: float, gradient: Array) -> bool:
@@ -266,8 +274,10 @@ def fit_lbfgs(
         away = point - np.asarray(best.point)
         return best.loss + 10 * abs(best.loss) + 10, away / max(float(np.linalg.norm(away)), 1e-12)
 
+    # A mean per step differs by the inverse number of steps between what the data tell apart.
+    options = {"maxfun": steps, "ftol": 1e-13, "gtol": 1e-9}
     found = scipy.optimize.minimize(
-        graded, np.asarray(free.start), jac=True, method="L-BFGS-B", options={"maxfun": steps}
+        graded, np.asarray(free.start), jac=True, method="L-BFGS-B", options=options
     )
     rejected = int(np.isnan(history).sum())
     stopped = "converged" if found.success else "steps"

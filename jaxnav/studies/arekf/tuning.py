@@ -22,7 +22,7 @@ from jaxnav.numerics.lie import so3_local
 from jaxnav.studies.arekf.config import DRIFTING, SCENARIOS, ArekfConfig
 from jaxnav.studies.arekf.methods import Shared, filters, shared_of
 from jaxnav.studies.arekf.simulation import Run, Timing, World, build_world, fly_run, timing_of
-from jaxnav.studies.base import require
+from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.tuned import HeldOut, Measure, Parameter, Problem, Values
 from jaxnav.units import DEG, DEG_PER_SQRT_HOUR, HOUR
 
@@ -60,8 +60,7 @@ def problem(config: ArekfConfig) -> Problem:
     Raises:
         ConfigError: If the scenario is "all".
     """
-    one = "one of " + ", ".join(SCENARIOS)
-    require(config.scenario in SCENARIOS, "scenario", config.scenario, one)
+    require_one_scenario(config, SCENARIOS)
     world = build_world(config)
     factor = config.reported if config.scenario in DRIFTING else 1.0
     shared = shared_of(config, world, factor)
@@ -72,7 +71,6 @@ def problem(config: ArekfConfig) -> Problem:
         hard=None,
         held_out=_held_out(config, shared),
         measure=Measure("mean-square", "attitude RMSE, norm over three axes", "deg", DEG),
-        rivals=RIVALS,
         runs=8,
         steps=40,
         rate=0.3,

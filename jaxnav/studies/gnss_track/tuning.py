@@ -1,6 +1,5 @@
 """The noise and the switching of the track's models, found from its first half."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.tune.transforms import POSITIVE, UNIT
 from jaxnav.estimation.types import Info, Obs, replicate
 from jaxnav.navigation.models.kinematic import KinematicInput
-from jaxnav.studies.base import ConfigError
+from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.gnss_track.config import SCENARIOS, GnssTrackConfig
 from jaxnav.studies.gnss_track.study import (
     BANKS,
@@ -41,31 +40,6 @@ class Part(NamedTuple):
     observations: Obs
 
 
-def density_loss(config: GnssTrackConfig, data: TrackData, part: slice) -> Callable[[Array], Array]:
-    """Return the loss of a single filter's density on a part of the track.
-
-    Args:
-        config: The study's configuration.
-        data: The track.
-        part: Steps to use, such as ``slice(0, 1000)``; the filter starts at its first fix.
-
-    Returns:
-        ``(density [m^2/s^3]) -> `` mean negative log-likelihood per step [nats], differentiable.
-    """
-    inputs, observations = jax.tree.map(lambda leaf: leaf[part], (data.inputs, data.observations))
-    start = jnp.concatenate([observations.z[0], jnp.zeros(2)])
-    filter = kf(MODEL)
-
-    def loss(density: Array) -> Array:
-        params = filter_params(density, config, data)
-        initial = params.initial._replace(mean=start)
-        return negative_log_likelihood(
-            filter, params._replace(initial=initial), inputs, observations
-        )
-
-    return loss
-
-
 def problem(config: GnssTrackConfig) -> Problem:
     """Return the tuning of a bank with Markov switching: fit on the first half of the track.
 
@@ -79,14 +53,11 @@ def problem(config: GnssTrackConfig) -> Problem:
         ConfigError: If no log is given, or the scenario is "all".
         DataError: If the log is malformed or too short.
     """
-    if config.scenario == "all":
-        one = ", ".join(SCENARIOS)
-        raise ConfigError(f"scenario is all; a tuning needs one of {one}")
+    require_one_scenario(config, SCENARIOS)
     data = track_data(config, load(config))
     half = data.time.size // 2
     whole = Part(data.inputs, data.observations)
     first = jax.tree.map(lambda leaf: leaf[:half], whole)
-    rivals = ("hand-set", *(name for name in BANKS if name != "markov"), *config.single_ids)
     params_of = partial(_bank_params, config, data)
     return Problem(
         parameters=_parameters(config),
@@ -97,7 +68,6 @@ def problem(config: GnssTrackConfig) -> Problem:
         measure=Measure(
             "mean", "log-likelihood of a fix, the larger the better", "nats", per="blocks"
         ),
-        rivals=rivals,
         samples=half,
         steps=150,
         optimiser="lbfgs",

@@ -30,7 +30,8 @@ from jaxnav.navigation.models.sins_cns import (
     SinsCnsInput,
     sins_cns_attitude,
 )
-from jaxnav.studies.immae.config import ImmaeConfig
+from jaxnav.studies.base import require_one_scenario
+from jaxnav.studies.immae.config import SCENARIOS, ImmaeConfig
 from jaxnav.studies.immae.methods import (
     RULES,
     Member,
@@ -125,10 +126,14 @@ def problem(config: ImmaeConfig) -> Problem:
 
     The bank has Markov switching before Bayes' rule and the paper's windowed reset after it. It
     trains on flights of the linear chain, each with a burst of noise of its own, by the RMSE of the
-    attitude; it is judged on flights of ``config.chain`` with the noise step of the paper, and on
+    attitude; it is judged on flights of ``config.chain`` with the noise of the scenario, and on
     such with two bursts. Everything runs on the autonomous attitude part of the error model, whose
     attitude and weights are those of all 15 states.
+
+    Raises:
+        ConfigError: If the scenario is "all".
     """
+    require_one_scenario(config, SCENARIOS)
     world = build_world(config)
     return Problem(
         parameters=_parameters(config),
@@ -136,13 +141,12 @@ def problem(config: ImmaeConfig) -> Problem:
         loss=partial(_rmse, config, True),
         hard=partial(_rmse, config, False),
         held_out={
-            "noise step of the paper": partial(_judge, config, world, world.step_scale),
+            f"{config.scenario} of the paper": partial(_judge, config, world, world.step_scale),
             "two bursts, never seen": partial(_judge, config, world, two_bursts(config.steps)),
         },
         measure=Measure(
             "mean-square", "attitude RMSE, root mean over three axes", "arcsec", ARCSEC
         ),
-        rivals=("tuned, hard rule", *PANEL),
         fresh=True,
         notes=(
             "Q0 and theta together have one factor too many: their product is what is learned.",

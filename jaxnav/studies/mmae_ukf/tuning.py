@@ -22,7 +22,7 @@ from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import SinsTotal, SinsTotalInput
 from jaxnav.numerics.lie import so3_local
 from jaxnav.numerics.sigma import unscented
-from jaxnav.studies.base import require
+from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.mmae_ukf.config import SCENARIOS, STATES, MmaeUkfConfig
 from jaxnav.studies.mmae_ukf.methods import (
     UKF_RULES,
@@ -79,8 +79,7 @@ def problem(config: MmaeUkfConfig) -> Problem:
     Raises:
         ConfigError: If the scenario is "all".
     """
-    one = "one of " + ", ".join(SCENARIOS)
-    require(config.scenario in SCENARIOS, "scenario", config.scenario, one)
+    require_one_scenario(config, SCENARIOS)
     short = _shortened(config)
     setup = setup_of(config)
     filter = ukf(model_of(setup))
@@ -97,7 +96,6 @@ def problem(config: MmaeUkfConfig) -> Problem:
         measure=Measure(
             "mean-square", "attitude RMSE, root mean over three axes", "arcsec", ARCSEC
         ),
-        rivals=("tuned, hard rule", *RIVALS),
         runs=4,
         steps=20,
         rate=0.2,

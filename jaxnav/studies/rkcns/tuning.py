@@ -16,7 +16,7 @@ from jaxnav.estimation.tune.transforms import POSITIVE
 from jaxnav.estimation.types import FilterParams, Gaussian, Obs
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsInput
-from jaxnav.studies.base import require
+from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.rkcns.config import SCENARIOS, RkcnsConfig
 from jaxnav.studies.rkcns.methods import Setup, Shared, filters, problem_of, setup_of, shared_of
 from jaxnav.studies.rkcns.simulation import build_world, fly_run
@@ -58,8 +58,7 @@ def problem(config: RkcnsConfig) -> Problem:
         ConfigError: If the scenario is "all".
         DataError: If the star table is missing or malformed.
     """
-    one = "one of " + ", ".join(SCENARIOS)
-    require(config.scenario in SCENARIOS, "scenario", config.scenario, one)
+    require_one_scenario(config, SCENARIOS)
     setup = setup_of(config, (METHOD,))
     shared = shared_of(config, build_world(config))
     text = "standard deviation of a refraction angle that the filter believes [arcsec]"
@@ -73,7 +72,6 @@ def problem(config: RkcnsConfig) -> Problem:
         hard=partial(_rmse, setup, shared, 0.0),
         held_out={"flights of the study": partial(_judge, config, shared)},
         measure=Measure("mean-square", "position RMSE, norm over three axes", "m"),
-        rivals=("tuned, hard rule", *RIVALS),
         runs=8,
         steps=25,
         rate=0.1,

@@ -22,14 +22,14 @@ from jaxnav.estimation.types import (
     FilterParams,
     Gaussian,
     Info,
-    Model,
     Obs,
     WeightRule,
     replicate,
 )
 from jaxnav.navigation.earth import offset_between
 from jaxnav.navigation.models.sins_gnss import CHANNELS, sins_gnss
-from jaxnav.studies.sage_husa.config import SageHusaConfig
+from jaxnav.studies.base import require_one_scenario
+from jaxnav.studies.sage_husa.config import SCENARIOS, SageHusaConfig
 from jaxnav.studies.sage_husa.methods import (
     BANKS,
     Shared,
@@ -67,7 +67,11 @@ def problem(config: SageHusaConfig) -> Problem:
     spells of added noise of its own, and is judged on whole drives with the paper's spells, and on
     such with three others. All filters are extended ones, the rivals too: on a vehicle they hardly
     differ from the study's unscented ones, at a fraction of the cost.
+
+    Raises:
+        ConfigError: If the scenario is "all".
     """
+    require_one_scenario(config, SCENARIOS)
     training = config
     if config.duration_s > TRAINING_S:
         times = {"first_noise_s": (500.0, 600.0), "second_noise_s": (700.0, 800.0)}
@@ -83,7 +87,6 @@ def problem(config: SageHusaConfig) -> Problem:
             "three spells, never seen": partial(_judge, config, world, three_spells(config.steps)),
         },
         measure=Measure("mean-square", "RMSE east and north, root mean of both", "m"),
-        rivals=("tuned, hard rule", *RIVALS),
         runs=8,
         validation_runs=8,
         steps=25,
@@ -143,10 +146,10 @@ def _draw(config: SageHusaConfig, world: World, key: Array, runs: int) -> Run:
 
 
 @cache
-def tuned_member(build: Callable[[Model], Filter], smooth: bool) -> Filter:
-    """Return the Sage-Husa filter that a member is, of any build."""
+def _member(smooth: bool) -> Filter:
+    """Return the Sage-Husa filter that a member is."""
     model = informed(sins_gnss())
-    return sage_husa(build, model, channels=len(CHANNELS), current=True, smooth=smooth)
+    return sage_husa(ekf, model, channels=len(CHANNELS), current=True, smooth=smooth)
 
 
 def _rule(smooth: bool) -> WeightRule:
@@ -185,7 +188,7 @@ class Watched(NamedTuple):
 
 def _flown(smooth: bool, params: FilterParams, drive: Run) -> Watched:
     """Run a member over a drive."""
-    member = tuned_member(ekf, smooth)
+    member = _member(smooth)
 
     def record(state: Any, info: Info) -> tuple[Info, Array]:
         return info, member.estimate(state).mean.position

@@ -1,0 +1,91 @@
+"""The likeliest time offset between the receiver and the inertial sensors."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.datasets.drive import DriveLog
+from jaxnav.estimation.filters.kalman import ekf
+from jaxnav.estimation.run import run
+from jaxnav.estimation.types import Filter, FilterParams, Info, Obs
+from jaxnav.navigation.models.level_errors import error_form
+from jaxnav.navigation.models.vehicle import FIXES, vehicle
+from jaxnav.numerics.linalg import cholesky, solve_lower
+from jaxnav.recorded.config import FilterConfig
+from jaxnav.recorded.methods import filter_params
+from jaxnav.recorded.preparation import prepare
+
+STEPS = 6
+CLOSE_S = 5e-4
+"""A step below half a millisecond ends the search."""
+LARGEST_STEP_S = 0.2
+"""The first order in the offset is good for less than that; a step back is half of that before."""
+
+
+class Offset(NamedTuple):
+    """The likeliest offset [s], its standard deviation [s], and whether the search ended there."""
+
+    value_s: float
+    sigma_s: float
+    found: bool
+
+
+def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
+    """Return the offset that makes the fixes likeliest, by Gauss-Newton steps.
+
+    The derivative of the log-likelihood is that of a filter of receiver and inertial sensors by
+    the model's own offset; after each step the fixes are moved by it exactly.
+
+        step = sum(dl/dt) / sum(dnu/dt' inv(S) dnu/dt)
+
+    The standard deviation is the inverse root of the denominator: of an ideal filter, and so too
+    small where other errors act like an offset.
+
+    Args:
+        log: The drive.
+        config: The configuration; the search starts from its offset.
+    """
+    plain = replace(config, filter="ekf", constraints=False, r_factors=(1.0,), q_factors=(1.0,))
+    filter = ekf(vehicle(constrained=False))
+    value, sigma, step = config.time_offset_s, float("nan"), 0.0
+    for _ in range(STEPS):
+        drive = prepare(log, replace(plain, time_offset_s=value), config.noise_rate_hz)
+        form = error_form("additive", drive.initial.mean.position)
+        params = filter_params(plain, drive, log.lever_arm, form)
+        # Whole hundreds of periods, so that a start moved by one does not compile anew.
+        whole = slice(len(drive.time) // 100 * 100 or None)
+        inputs = jax.tree.map(lambda leaf, whole=whole: leaf[whole], drive.inputs)
+        obs = Obs(*(leaf[whole, FIXES] for leaf in drive.observations))
+        slope, information = _score(filter, params, inputs, obs)
+        sigma = float(information) ** -0.5
+        newton, limit = float(slope / information), LARGEST_STEP_S
+        if newton * step < 0:
+            limit = 0.5 * abs(step)
+        step = max(-limit, min(limit, newton))
+        value += step
+        if abs(step) < CLOSE_S:
+            break
+    return Offset(value, sigma, abs(step) < CLOSE_S)
+
+
+@partial(jax.jit, static_argnums=0)
+def _score(filter: Filter, params: FilterParams, inputs: Any, obs: Obs) -> tuple[Array, Array]:
+    """Return the derivative of the log-likelihood by the offset, and its information."""
+
+    def record(state: Any, info: Info) -> Any:
+        del state
+        return info.log_likelihood, info.innovation, info.innovation_cov
+
+    def followed(offset: Array) -> Any:
+        own = params._replace(model=params.model._replace(time_offset=offset))
+        return run(filter, own, inputs, obs, record=record).record
+
+    zero = jnp.zeros(())
+    (_, _, S), (slope, moved, _) = jax.jvp(followed, (zero,), (jnp.ones(()),))
+    root = jax.vmap(lambda S: cholesky(S).factor)(S)
+    whitened = jax.vmap(solve_lower)(root, moved)
+    return jnp.sum(slope), jnp.sum(whitened**2)
