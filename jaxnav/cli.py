@@ -178,7 +178,7 @@ def _tune(rest: list[str]) -> int:
         print_document(finite_or_null(report.document))
     else:
         print_tuning(report.document, directory, figures)
-    return OK
+    return DIVERGED if report.document["diverged"] else OK
 
 
 def _log_problem(path: str, config: Any) -> Any:

@@ -8,7 +8,15 @@ import numpy as np
 import optax
 import pytest
 
-from jaxnav.estimation.banks.mixture import BankParams, mmae
+from jaxnav.estimation.banks.mixture import BankParams, bank, mmae, rewatch
+from jaxnav.estimation.banks.weights import (
+    WindowedReset,
+    bayes,
+    chain,
+    floor,
+    markov,
+    windowed_reset,
+)
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.fit import Validation, fit, fit_lbfgs
@@ -257,6 +265,27 @@ def test_losses_are_those_of_the_records() -> None:
     np.testing.assert_allclose(weigh(terms, found, weights), total, rtol=1e-12)
     alone = negative_log_likelihood(filter, params, inputs, Obs(z[0], valid))
     np.testing.assert_allclose(alone, found["likelihood"][0, 0], rtol=1e-12)
+
+
+def test_a_rule_over_members_that_have_run_gives_the_weights_of_their_bank() -> None:
+    rng = np.random.default_rng(8)
+    z = jnp.asarray(np.cumsum(rng.standard_normal((40, 2)), axis=0))
+    valid = jnp.ones((40, 2), bool).at[3].set(False)
+    members = replicate(FilterParams(jnp.ones(2), Gaussian(jnp.zeros(2), jnp.eye(2))), 3)
+    members = members._replace(model=jnp.array([[0.2, 0.2], [1.0, 1.0], [5.0, 5.0]]))
+    rule = chain(markov(), bayes(), windowed_reset(), floor())
+    given = (jnp.array(0.01), (), WindowedReset(7.0, 0.6), jnp.array(1e-3))
+    params = BankParams(members, given, jnp.array([0.0, -1.0, 0.5]))
+    observations, inputs = Obs(z, valid), jnp.zeros(40)
+
+    def weights(state: Any, info: Any) -> jax.Array:
+        del info
+        return state.log_weights
+
+    expected = run(bank(kf(SCALAR), rule), params, inputs, observations, record=weights).record
+    each = jax.vmap(lambda own: run(kf(SCALAR), own, inputs, observations).record[1], out_axes=1)
+    watched = run(rewatch(rule), params, each(members), observations, record=weights).record
+    np.testing.assert_allclose(watched, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow

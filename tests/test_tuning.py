@@ -147,6 +147,29 @@ def test_a_loss_that_starts_non_finite_is_named() -> None:
             run_tuning("none", {}, problem, TuneConfig(optimiser=optimiser))
 
 
+def test_runs_held_out_that_diverge_are_counted() -> None:
+    """And bounds hold: the loss falls towards zero, the parameter stays above a half."""
+    problem = Problem(
+        parameters={"a": Parameter(1.0, POSITIVE, "a number")},
+        draw=lambda key, runs: jnp.zeros(()),
+        loss=lambda values, data: values["a"] ** 2 + data,
+        hard=None,
+        held_out={
+            "three runs": lambda values, key, runs: {
+                "tuned": np.array([1.0, 2.0, 3.0]),
+                "hand-set": np.array([1.0, np.nan, 3.0]),
+            }
+        },
+        measure=Measure("mean-square", "nothing", "1"),
+        fresh=True,
+    )
+    report = run_tuning("none", {}, problem, TuneConfig(bounds=("a=0.5:2",), steps=40))
+    assert report.document["diverged"] == 1
+    assert any("diverged in 1 of" in note for note in report.document["notes"])
+    assert 0.5 < report.fit.params["a"] < 0.6
+    assert report.fit.validation[0, 0] == 0
+
+
 def test_starts_and_bounds_are_read() -> None:
     assert parse_start(("a=1,2.5", "b=-3e-4")) == {"a": (1.0, 2.5), "b": (-3e-4,)}
     assert parse_bounds(("a=-1:2",)) == {"a": (-1.0, 2.0)}

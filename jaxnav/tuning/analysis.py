@@ -90,6 +90,7 @@ def tune(
         held_out[label] = judge(found.params, keys[JUDGE], config.held_out_runs)
         if progress is not None:
             progress("held out", number, len(problem.held_out))
+    diverged = max((_diverged(scores) for scores in held_out.values()), default=0)
     profiled, missing = _profiled(found.params, chosen, losses, config)
     known, unknown = _uncertainty(problem, found.params, chosen, losses, config)
     document = {
@@ -107,7 +108,8 @@ def tune(
         "held_out": {
             label: _verdict(scores, problem.measure) for label, scores in held_out.items()
         },
-        "notes": [*problem.notes, *missing, *unknown, *_warnings(found, checked)],
+        "diverged": diverged,
+        "notes": [*problem.notes, *missing, *unknown, *_warnings(found, checked, diverged)],
     }
     return Report(document, _arrays(found, profiled, held_out), found, profiled)
 
@@ -298,8 +300,15 @@ def compared(tuned: np.ndarray, rival: np.ndarray, measure: Measure) -> Interval
     return mean_interval((tuned - rival) / measure.scale)
 
 
-def _warnings(found: Fit, checked: GradientCheck | None) -> list[str]:
+def _diverged(scores: dict[str, np.ndarray]) -> int:
+    """Return in how many runs the score of a method is not finite."""
+    return int(np.sum(~np.all(np.isfinite(np.stack(list(scores.values()))), axis=0)))
+
+
+def _warnings(found: Fit, checked: GradientCheck | None, diverged: int) -> list[str]:
     notes = []
+    if diverged:
+        notes.append(f"a method diverged in {diverged} of the runs held out")
     if found.rejected:
         notes.append(f"{found.rejected} evaluations were not finite; their steps were taken back")
     if checked is not None and checked.error > LOOSE_GRADIENT:
