@@ -16,18 +16,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-DEVICES = 2
+from jaxnav.compiling import cores
+
 TOLERANCE = 1e-8
 
 
 def setup() -> None:
-    """Turn on float64 and one host device a core; called before anything touches a device."""
+    """Turn on float64; called before anything touches a device."""
     jax.config.update("jax_enable_x64", True)
-    try:
-        jax.config.update("jax_num_cpu_devices", DEVICES)
-    except RuntimeError:
-        found = len(jax.local_devices())
-        Console().print(f"JAX is running already, with {found} device(s); {DEVICES} were wanted.")
 
 
 def arguments(doc: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
@@ -165,7 +161,7 @@ def report(
 def machine() -> dict[str, Any]:
     """Describe what the figures were taken on."""
     return {
-        "devices": len(jax.local_devices()),
+        "cores": cores(),
         "python": platform.python_version(),
         "jax": jax.__version__,
         "processor": platform.machine(),

@@ -135,7 +135,6 @@ def study(own: Own, flights: Flights) -> Callable[[Any], Answer]:
     """Return the Monte Carlo study of a filter as a function of its parameters."""
     key, runs = jax.random.key(1), len(flights.z)
     keys = run_keys(key, runs)
-    devices = jax.local_devices()[:1] if own.qr else None
 
     def kept(state: Any, info: Any) -> Any:
         return own.filter.estimate(state).mean, info.log_likelihood
@@ -149,7 +148,7 @@ def study(own: Own, flights: Flights) -> Callable[[Any], Answer]:
         return RunOutput(trace.record)
 
     def call(params: Any) -> Answer:
-        return monte_carlo(run_one, key, runs, (keys, flights, params), devices=devices).rows
+        return monte_carlo(run_one, key, runs, (keys, flights, params)).rows
 
     return call
 
@@ -186,9 +185,8 @@ def own_entry(
     call = study(own, part)
     first = common.seconds(lambda: call(checked))
     check(call(checked))
-    spread = "one device" if own.qr else "devices"
     lanes = part.z.shape[0] * part.z.shape[1] * own.models
-    return Entry("jaxnav", own.method, spread, lambda: call(params), lanes, first)
+    return Entry("jaxnav", own.method, "threads", lambda: call(params), lanes, first)
 
 
 class Truths:

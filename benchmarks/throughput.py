@@ -21,6 +21,7 @@ from benchmarks import _common as common
 from benchmarks._ours import Statistics, structured, unstructured
 from benchmarks._peers import CONTESTANTS, Contestant, Missing
 from benchmarks._problem import THETA, Dense, dense, make_problem, oracle
+from jaxnav.compiling import cores
 from jaxnav.units import ARCSEC
 
 RUNS = (16, 128)
@@ -104,10 +105,10 @@ def line_up(steps: int, runs: int, own: bool) -> tuple[list[Entry], list[str]]:
     matrices = dense(problem, own)
     part = shortened(matrices, runs, DENSE_LANE_STEPS)
     entries = [
-        study_entry("jaxnav", "devices", structured(problem, own), matrices, ARCSEC),
-        study_entry("jaxnav, dense F", "devices", unstructured(part), part),
+        study_entry("jaxnav", "threads", structured(problem, own), matrices, ARCSEC),
+        study_entry("jaxnav, dense F", "threads", unstructured(part), part),
     ]
-    if runs >= common.DEVICES * LARGE_TILE:
+    if runs >= cores() * LARGE_TILE:
         wide = structured(problem, own, LARGE_TILE)
         entries.append(study_entry("jaxnav", f"tiles of {LARGE_TILE}", wide, matrices, ARCSEC))
     notes = []

@@ -269,7 +269,7 @@ def _allan(rest: list[str]) -> int:
 
 
 def configure_jax() -> None:
-    """Set JAX up for a process of our own: 64-bit floats, one device per core, a compile cache.
+    """Set JAX up for a process of our own: 64-bit floats and a cache of compiled programs.
 
     An explicit ``JAX_ENABLE_X64=0`` is left alone, so that a study can refuse it.
     """
@@ -277,20 +277,11 @@ def configure_jax() -> None:
 
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
-    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        jax.config.update("jax_num_cpu_devices", _cores())
     # Every result is waited for anyhow, and a single step need not wait for another thread.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "jaxnav" / "xla"))
-
-
-def _cores() -> int:
-    """Return the number of cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def entry() -> None:

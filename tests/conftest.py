@@ -8,20 +8,11 @@ import jax
 import pytest
 
 from jaxnav.datasets.base import DataError
-from jaxnav.estimation import montecarlo
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-
-
-@pytest.fixture(autouse=True, scope="session")
-def studies_use_one_device() -> Iterator[None]:
-    """Run studies on one device: every device compiles anew, and the workers share the cores."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(montecarlo, "default_devices", lambda: jax.local_devices()[:1])
-        yield
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -10,6 +10,7 @@ ROOT = Path(jaxnav.__file__).parent
 # From the ground up; a module may import from layers before its own and from its own folder's rank.
 ORDER = (
     "units",
+    "compiling",
     "numerics.linalg",
     "numerics.lie",
     "numerics.se23",

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,31 +12,42 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.estimation.montecarlo import Campaign, RunOutput, monte_carlo
+from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.study import run_campaign
+from tests.programs import compilations
 
 
 @pytest.mark.slow
-def test_tiles_and_devices_do_not_change_a_run() -> None:
+def test_tiles_threads_and_devices_do_not_change_a_run() -> None:
     config = ImmaeConfig(chain="linear", runs=16, duration_s=20.0)
-    one, two = jax.local_devices()[:1], jax.local_devices()[:2]
-    assert len(two) == 2
-
-    def campaign(tile: int, devices: list[Any]) -> Campaign:
-        return run_campaign(config, tile=tile, devices=devices, keep=1)
-
-    reference = campaign(16, one)
+    both = jax.local_devices()[:2]
+    assert len(both) == 2
+    reference = run_campaign(config, keep=1)
     for tile in (1, 7, 16):
-        narrow, wide = campaign(tile, one), campaign(tile, two)
-        for a, b in zip(jax.tree.leaves(narrow.rows), jax.tree.leaves(wide.rows), strict=True):
-            np.testing.assert_array_equal(a, b)
+        narrow = run_campaign(config, tile=tile, threads=1, keep=1)
+        for options in ({"threads": 2}, {"threads": 5}, {"devices": both}):
+            wide = run_campaign(config, tile=tile, keep=1, **options)
+            for a, b in zip(jax.tree.leaves(narrow), jax.tree.leaves(wide), strict=True):
+                np.testing.assert_array_equal(a, b)
         for a, b in zip(jax.tree.leaves(narrow.rows), jax.tree.leaves(reference.rows), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-9)
         for a, b in zip(
             jax.tree.leaves(narrow.curve), jax.tree.leaves(reference.curve), strict=True
         ):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.slow
+def test_another_number_of_runs_gives_the_same_rows_and_compiles_nothing() -> None:
+    config = ImmaeConfig(chain="linear", runs=16, duration_s=20.0)
+    many = run_campaign(config, tile=4)
+    with compilations() as programs:
+        for runs in (1, 3, 9):
+            few = run_campaign(replace(config, runs=runs), tile=4)
+            for a, b in zip(jax.tree.leaves(few.rows), jax.tree.leaves(many.rows), strict=True):
+                np.testing.assert_array_equal(a, b[:runs])
+    assert programs == []
 
 
 def _noisy(key: jax.Array, shared: jax.Array) -> RunOutput:
@@ -77,16 +89,26 @@ def test_progress_counts_runs() -> None:
         11,
         jnp.zeros(()),
         tile=2,
-        devices=jax.local_devices()[:2],
         progress=lambda done, total: seen.append((done, total)),
     )
-    assert seen == [(4, 11), (8, 11), (11, 11)]
+    assert seen == [(2, 11), (4, 11), (6, 11), (8, 11), (10, 11), (11, 11)]
 
 
-@pytest.mark.parametrize(("runs", "tile"), [(0, None), (-3, None), (4, 0)])
-def test_numbers_that_are_not_positive_are_refused(runs: int, tile: int | None) -> None:
-    with pytest.raises(ValueError, match="at least 1"):
-        monte_carlo(_noisy, jax.random.key(0), runs, jnp.zeros(()), tile=tile)
+@pytest.mark.parametrize(
+    ("runs", "options", "said"),
+    [
+        (0, {}, "runs is 0; it must be at least 1"),
+        (-3, {}, "runs is -3; it must be at least 1"),
+        (4, {"tile": 0}, "tile is 0; it must be at least 1"),
+        (4, {"threads": 0}, "threads is 0; it must be at least 1"),
+        (4, {"devices": []}, "devices is empty"),
+    ],
+)
+def test_numbers_that_are_not_positive_are_refused(
+    runs: int, options: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        monte_carlo(_noisy, jax.random.key(0), runs, jnp.zeros(()), **options)
 
 
 @pytest.mark.slow
@@ -98,7 +120,6 @@ def test_ten_thousand_runs_of_the_linear_chain_hold_in_memory() -> None:
         from pathlib import Path
         import jax
         jax.config.update("jax_enable_x64", True)
-        jax.config.update("jax_num_cpu_devices", 2)
         from jaxnav.studies.immae.config import ImmaeConfig
         from jaxnav.studies.immae.study import run_campaign
         def peak():

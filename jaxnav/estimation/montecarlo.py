@@ -1,9 +1,8 @@
 """Monte Carlo: a run as a function of its key, mapped over many keys, tile by tile."""
 
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled, cores
+
 TILE = 16
-"""Largest number of runs in a tile by default: the working set of a bank of seven 15-state filters
-then stays within the second-level cache."""
+"""Number of runs in a tile on a CPU: the working set of a bank of seven 15-state filters then stays
+within the second-level cache."""
+WIDE_TILE = 1024
+"""Number of runs in a tile on an accelerator."""
 
 
 class RunOutput(NamedTuple):
@@ -61,90 +64,83 @@ def monte_carlo(
     *,
     tile: int | None = None,
     devices: Sequence[Any] | None = None,
+    threads: int | None = None,
     keep: int = 0,
-    compile_in_turn: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Campaign:
     """Run a Monte Carlo study; run ``i`` has the key ``fold_in(key, i)`` whatever the tiling.
 
-    A tile is a ``vmap`` over its runs; the devices compute tiles side by side with the same
-    program, which a second call with the same ``run_one`` and shapes uses again. Per-run
-    rows are the same, bit for bit, for any number of devices and any order at the same tile shape,
-    and equal to rounding for other shapes.
+    A tile is a ``vmap`` over its runs, a program of one shape: the last tile is filled up, so that
+    another number of runs compiles nothing. Threads compute tiles side by side, one for each core
+    of a CPU, and a second call with the same ``run_one`` and shapes uses the program again. Per-run
+    rows are the same, bit for bit, for any number of runs, threads and devices at the same tile,
+    and equal to rounding for other tiles.
 
     Args:
         run_one: ``(key, shared) -> RunOutput``; pure.
         key: Root key.
         runs: Number of runs, at least one.
         shared: Pytree that all runs see; what depends on it alone is computed once per tile.
-        tile: Runs per tile and device; the default spreads the runs evenly, at most :data:`TILE`.
-        devices: Devices to use; the default is :func:`default_devices`.
+        tile: Runs per tile; the default is :data:`TILE` on a CPU, :data:`WIDE_TILE` elsewhere.
+        devices: Devices to use; the default is the first local one. Each compiles for itself.
+        threads: Tiles that a device computes side by side; the default shares the cores of this
+            process among devices that are CPUs, and is one elsewhere.
         keep: Number of first runs whose ``trace`` is kept.
-        compile_in_turn: Compile for one device after the other instead of for all at once: a large
-            program takes more memory to compile than to run.
-        progress: Called with (runs done, runs) after each round of tiles, on the host.
+        progress: Called with (runs done, runs) after each tile, on the host.
 
     Returns:
         The campaign.
 
     Raises:
-        ValueError: If ``runs`` or ``tile`` is not positive.
+        ValueError: If ``runs``, ``tile`` or ``threads`` is not positive, or there is no device.
     """
-    if runs < 1:
-        raise ValueError(f"runs is {runs}; a Monte Carlo study needs at least 1")
-    chosen = list(devices) if devices is not None else default_devices()
+    chosen = list(jax.local_devices()[:1] if devices is None else devices)
+    if not chosen:
+        raise ValueError("devices is empty; a Monte Carlo study needs at least one")
+    on_cpu = chosen[0].platform == "cpu"
     if tile is None:
-        tile = _even_tile(runs, len(chosen))
-    if tile < 1:
-        raise ValueError(f"tile is {tile}; it needs at least 1 run")
-    stride = tile * len(chosen)
+        tile = TILE if on_cpu else WIDE_TILE
+    if threads is None:
+        threads = max(cores() // len(chosen), 1) if on_cpu else 1
+    for name, value in (("runs", runs), ("tile", tile), ("threads", threads)):
+        if value < 1:
+            raise ValueError(f"{name} is {value}; it must be at least 1")
+    starts = range(0, runs, tile)
     inputs = [jax.device_put((key, jnp.int32(runs), shared), device) for device in chosen]
-    pieces: list[tuple[Any, np.ndarray]] = []
-    total: Any = None
-    traces: list[Any] = []
-
+    free: SimpleQueue[Any] = SimpleQueue()
+    for each in inputs * threads:
+        free.put(each)
     # A thread does not inherit the precision that a context manager has set for its caller.
     wide = jnp.result_type(float) == jnp.float64
 
-    def launch(start: int, place: int) -> tuple[RunOutput, Array]:
-        first = np.int32(start + place * tile)
-        with jax.enable_x64(wide):
-            return _run_tile(run_one, tile, keep > 0, first, *inputs[place])
+    def compute(start: int) -> tuple[RunOutput, Array]:
+        given = free.get()
+        try:
+            with jax.enable_x64(wide):
+                output = _run_tile(run_one, tile, keep > 0, np.int32(start), *given)
+                return jax.block_until_ready(output)
+        finally:
+            free.put(given)
 
-    def compute(start: int, place: int) -> tuple[RunOutput, Array]:
-        return jax.block_until_ready(launch(start, place))
-
-    with ThreadPoolExecutor(len(chosen)) as pool:
-        for start in range(0, runs, stride):
-            if compile_in_turn and start == 0:
-                # A call returns once it has compiled; the devices then run side by side.
-                results = jax.block_until_ready([launch(0, place) for place in range(len(chosen))])
-            else:
-                results = list(pool.map(partial(compute, start), range(len(chosen))))
-            for place, (output, finite) in enumerate(results):
-                first = start + place * tile
-                count = min(max(runs - first, 0), tile)
-                kept = min(max(keep - first, 0), count)
-                pieces.append(_first((output.row, finite), count))
-                total = _add(total, output.curve)
-                if kept:
-                    traces.append(_first(output.trace, kept))
+    pieces: list[tuple[Any, np.ndarray]] = []
+    total: Any = None
+    traces: list[Any] = []
+    pool = ThreadPoolExecutor(min(len(inputs) * threads, len(starts)))
+    try:
+        for start, (output, finite) in zip(starts, pool.map(compute, starts), strict=True):
+            count = min(runs - start, tile)
+            kept = min(max(keep - start, 0), count)
+            pieces.append(_first((output.row, finite), count))
+            total = _add(total, output.curve)
+            if kept:
+                traces.append(_first(output.trace, kept))
             if progress is not None:
-                progress(min(start + stride, runs), runs)
+                progress(start + count, runs)
+    finally:
+        pool.shutdown(cancel_futures=True)
     rows, finite = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *traces) if traces else ()
     return Campaign(rows, total, joined, finite)
-
-
-def default_devices() -> list[Any]:
-    """Return the devices that a study uses unless told otherwise: all local ones."""
-    return jax.local_devices()
-
-
-def _even_tile(runs: int, devices: int) -> int:
-    """Return the tile that spreads the runs over equal rounds of at most :data:`TILE` a device."""
-    rounds = math.ceil(runs / (devices * TILE))
-    return math.ceil(runs / (devices * rounds))
 
 
 def _add(total: Any, curve: Any) -> Any:
@@ -158,7 +154,7 @@ def _first(tree: Any, count: int) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], tree)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@compiled(static_argnums=(0, 1, 2))
 def _run_tile(
     run_one: Callable[[Array, Any], RunOutput],
     tile: int,
@@ -168,11 +164,7 @@ def _run_tile(
     runs: Array,
     shared: Any,
 ) -> tuple[RunOutput, Array]:
-    """Compute the tile of runs from ``start``; every device runs this same program.
-
-    One program split over the devices (``shard_map``) is compiled differently for one device and
-    for two, and its results differ in the last bits.
-    """
+    """Compute the tile of runs from ``start``."""
     indices = start + jnp.arange(tile, dtype=jnp.int32)
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
     output = jax.vmap(run_one, in_axes=(0, None))(keys, shared)

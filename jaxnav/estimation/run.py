@@ -1,13 +1,13 @@
 """Runs over time: the only ``lax.scan`` over filter time."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.types import Filter, Input, Model, Obs, Params
 
 Recorder = Callable[[Any, Any], Any]
@@ -64,7 +64,7 @@ def run(
     return _run(filter, record, every, segment, params, inputs, observations)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@compiled(static_argnums=(0, 1, 2, 3))
 def _run(
     filter: Filter,
     record: Recorder | None,

@@ -51,7 +51,7 @@ def run_campaign(config: ArekfConfig, factor: float, **options: Any) -> Campaign
     one = run_one(setup_of(config))
     key = jax.random.key(config.seed)
     # A trace is always kept: the program is then the same for all factors and scenarios.
-    return monte_carlo(one, key, config.runs, shared, keep=1, compile_in_turn=True, **options)
+    return monte_carlo(one, key, config.runs, shared, keep=1, **options)
 
 
 def run_campaigns(

@@ -36,7 +36,7 @@ def run_sweep(config: ArekfConfig, **options: Any) -> Campaign:
     shared = shared_of(config, build_world(config), 1.0)
     one = _run_one(setup_of(config), config.r_factors)
     key = jax.random.key(config.seed)
-    return monte_carlo(one, key, config.runs, shared, compile_in_turn=True, **options)
+    return monte_carlo(one, key, config.runs, shared, **options)
 
 
 @cache

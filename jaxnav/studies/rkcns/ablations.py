@@ -88,7 +88,7 @@ def run_campaign(
     shared = shared_of(config, build_world(config))
     one = run_one(setup_of(config, methods, printed=printed))
     key = jax.random.key(config.seed)
-    return monte_carlo(one, key, config.runs, shared, compile_in_turn=True, **options)
+    return monte_carlo(one, key, config.runs, shared, **options)
 
 
 def run_ablations(
