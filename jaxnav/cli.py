@@ -118,7 +118,7 @@ def _run(rest: list[str]) -> int:
     parsed = parse_run(name, study.load("config"), options)
     if parsed is None:
         return OK
-    configure_jax()
+    configure_jax(cache=parsed.cache)
     from jaxnav.report import Progress, print_json, print_result
     from jaxnav.results import claim_directory, write
 
@@ -159,7 +159,7 @@ def _tune(rest: list[str]) -> int:
     )
     if parsed is None:
         return OK
-    configure_jax()
+    configure_jax(cache=parsed.cache)
     from jaxnav.report import Progress, print_document, print_tuning
     from jaxnav.results import claim_directory, finite_or_null, write_arrays, write_document
     from jaxnav.studies.base import plain
@@ -214,7 +214,7 @@ def _filter(rest: list[str]) -> int:
     parsed = parse_filter(options)
     if parsed is None:
         return OK
-    configure_jax()
+    configure_jax(cache=parsed.cache)
     from jaxnav.datasets.formats import load_drive
     from jaxnav.recorded.analysis import analyse
     from jaxnav.recorded.config import check
@@ -248,7 +248,7 @@ def _allan(rest: list[str]) -> int:
     parsed = parse_allan(options)
     if parsed is None:
         return OK
-    configure_jax()
+    configure_jax(cache=parsed.cache)
     from jaxnav.noise_report.analysis import analyse, load
     from jaxnav.noise_report.figures import draw
     from jaxnav.report import print_allan, print_document
@@ -268,20 +268,29 @@ def _allan(rest: list[str]) -> int:
     return OK
 
 
-def configure_jax() -> None:
+def configure_jax(*, cache: bool = True) -> None:
     """Set JAX up for a process of our own: 64-bit floats and a cache of compiled programs.
 
     An explicit ``JAX_ENABLE_X64=0`` is left alone, so that a study can refuse it.
+
+    Args:
+        cache: Whether compiled programs are kept for the next process.
     """
     import jax
+
+    from jaxnav import program_cache
 
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     # Every result is waited for anyhow, and a single step need not wait for another thread.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(home / "jaxnav" / "xla"))
+    folder = program_cache.prepared() if cache else None
+    jax.config.update("jax_enable_compilation_cache", folder is not None)
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        # Most programs take less than the second below which JAX keeps none, and are hundreds.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 def entry() -> None:

@@ -7,6 +7,7 @@ is tried once, on a program of one operation, and left out where it is refused.
 
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial, wraps
 from typing import Any
 
@@ -58,7 +59,9 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Call
 
 @cache
 def _top_level() -> Any:
-    return get_opaque_trace_state()
+    # The first call may come from within a trace; a thread of its own is outside of any.
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(get_opaque_trace_state).result()
 
 
 def _at_top_level() -> bool:

@@ -21,6 +21,7 @@ class Options(NamedTuple):
     config: Any
     out: Path
     json: bool
+    cache: bool
     study: Any = None
 
 
@@ -96,7 +97,7 @@ def _parse(
     default: Any = None,
     study: Any = None,
 ) -> Options | None:
-    """Parse the fields of a configuration, ``--out`` and ``--json``, and those of a study.
+    """Parse the fields of a configuration, ``--out``, ``--json``, ``--cache``, and a study's.
 
     ``default`` and ``study`` hold the values where no flag is given.
     """
@@ -105,6 +106,7 @@ def _parse(
         ("config", tyro.conf.OmitArgPrefixes[config], field(default=given)),
         ("out", Path, field(default=out)),
         ("json", bool, field(default=False)),
+        ("cache", bool, field(default=True)),
     ]
     if study is not None:
         parts.append(("study", type(study), field(default=study)))
@@ -115,6 +117,7 @@ def _parse(
         "    config: Parameters.\n"
         f"    out: Directory for {files}.\n"
         "    json: Print the summary as JSON instead of tables.\n"
+        "    cache: Keep compiled programs for the next time.\n"
         "    study: What the tuning starts from.\n"
     )
     said = io.StringIO()
@@ -126,7 +129,9 @@ def _parse(
             print(said.getvalue(), end="")
             return None
         raise ConfigError(_sentence(said.getvalue(), program)) from None
-    return Options(parsed.config, parsed.out, parsed.json, getattr(parsed, "study", None))
+    return Options(
+        parsed.config, parsed.out, parsed.json, parsed.cache, getattr(parsed, "study", None)
+    )
 
 
 def _sentence(box: str, program: str) -> str:

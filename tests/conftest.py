@@ -1,5 +1,8 @@
 """Strict settings for the whole suite: float64, no silent promotion, two host devices."""
 
+import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -7,12 +10,22 @@ from typing import Any
 import jax
 import pytest
 
+from jaxnav.cli import configure_jax
 from jaxnav.datasets.base import DataError
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Share compiled programs within this run, among its workers and commands; not with another."""
+    if not hasattr(config, "workerinput"):
+        folder = tempfile.mkdtemp(prefix="jaxnav-tests-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        os.environ["XDG_CACHE_HOME"] = folder
+    configure_jax()
 
 
 @pytest.fixture(autouse=True, scope="module")

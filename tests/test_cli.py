@@ -228,7 +228,7 @@ def test_list_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
         assert word in said
     assert main(["doctor"]) == OK
     said = capsys.readouterr().out
-    for word in ("jaxlib", "x64", "compilation cache"):
+    for word in ("jaxlib", "x64", "compiled programs", "compiler option"):
         assert word in said
 
 

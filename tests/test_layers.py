@@ -11,6 +11,7 @@ ROOT = Path(jaxnav.__file__).parent
 ORDER = (
     "units",
     "compiling",
+    "program_cache",
     "numerics.linalg",
     "numerics.lie",
     "numerics.se23",

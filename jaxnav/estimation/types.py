@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
@@ -271,5 +272,13 @@ def observed(z: Array) -> Obs:
 
 
 def replicate(params: Params, count: int) -> Params:
-    """Return ``params`` with a leading model axis of length ``count`` on every leaf."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), params)
+    """Return ``params`` with a leading model axis of length ``count`` on every leaf.
+
+    Leaves that are numbers or NumPy arrays stay with NumPy, which has nothing to compile.
+    """
+
+    def widened(leaf: Any) -> Any:
+        by = jnp if isinstance(leaf, Array) else np
+        return by.broadcast_to(leaf, (count, *jnp.shape(leaf)))
+
+    return jax.tree.map(widened, params)

@@ -76,6 +76,15 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
     names = tuple(rules)
     estimate_members = jax.vmap(filter.estimate)
 
+    # What the rules have in common is done for all of them at once: one body to compile.
+    def stacked(state: PanelState) -> Array:
+        return jnp.stack([state.log_weights[name] for name in names])
+
+    def by_name(results: Any) -> dict[str, Any]:
+        return {
+            name: jax.tree.map(lambda leaf, i=i: leaf[i], results) for i, name in enumerate(names)
+        }
+
     def init(params: BankParams) -> PanelState:
         members = jax.vmap(filter.init)(params.members)
         count = jax.tree.leaves(params.members)[0].shape[0]
@@ -107,17 +116,18 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
             )
             for name in names
         }
-        infos = {name: mixture_info(state.log_weights[name], info) for name in names}
+        infos = by_name(jax.vmap(mixture_info, (0, None))(stacked(state), info))
         memories = {name: memory for name, (memory, _) in moved.items()}
         log_weights = {name: weights for name, (_, weights) in moved.items()}
         return PanelState(members, memories, log_weights, state.step), infos
 
     def estimate(state: PanelState) -> dict[str, Gaussian]:
         members = estimate_members(state.members)
-        return {
-            name: moment_match(state.log_weights[name], members, filter.retract, filter.local)
-            for name in names
-        }
+
+        def mixed(log_weights: Array) -> Gaussian:
+            return moment_match(log_weights, members, filter.retract, filter.local)
+
+        return by_name(jax.vmap(mixed)(stacked(state)))
 
     def restart(state: PanelState, given: Gaussian) -> PanelState:
         members = jax.vmap(filter.restart, in_axes=(0, None))(state.members, given)
@@ -272,14 +282,10 @@ def _moment_match(log_weights: Array, members: Gaussian) -> Gaussian:
     w = jnp.where(used, jnp.exp(log_weights), 0)
     means = jnp.where(used[:, None], members.mean, 0)
     covs = jnp.where(used[:, None, None], members.cov, 0)
-    # Sums written out over the few models fuse; a reduction over a short axis does not.
-    models = range(log_weights.shape[0])
-    mean = sum((w[i] * means[i] for i in models), jnp.zeros_like(means[0]))
-    cov = jnp.zeros_like(covs[0])
-    for i in models:
-        spread = jnp.where(used[i], means[i] - mean, 0)
-        cov = cov + w[i] * (covs[i] + spread[:, None] * spread[None, :])
-    return Gaussian(mean, cov)
+    mean = w @ means
+    spread = jnp.where(used[:, None], means - mean[None], 0)
+    within = (w @ covs.reshape(w.shape[0], -1)).reshape(covs.shape[1:])
+    return Gaussian(mean, within + (w[:, None] * spread).T @ spread)
 
 
 def mixture_info(log_weights: Array, info: Info) -> Info:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxnav.estimation.banks.mixture import BankParams, PanelState, moment_match, panel
@@ -102,29 +103,29 @@ def members_filter(
 
 def panel_params(config: ImmaeConfig) -> BankParams:
     """Return the parameters of the panel: models, single filter and informed filter."""
-    theta = jnp.array([*config.theta, config.single_theta, 1.0])
+    theta = np.array([*config.theta, config.single_theta, 1.0])
     count = theta.shape[0]
-    initial = Gaussian(jnp.zeros(15), jnp.diag(prior_sigma(config) ** 2))
+    initial = Gaussian(np.zeros(15), np.diag(prior_sigma(config) ** 2))
     same = replicate(FilterParams(noise_of(config), initial), count)
     members = Member(
         model=same.model._replace(noise_scale=theta),
         initial=same.initial,
-        told=jnp.arange(count) == count - 1,
+        told=np.arange(count) == count - 1,
     )
     period = config.reset_period_s / config.filter_period_s
     rules: dict[str, Any] = {
         "kf": (),
         "mmae": (),
-        "immae": ((), WindowedReset(jnp.array(period), jnp.array(config.reset_threshold))),
-        "floor": ((), jnp.array(config.weight_floor)),
-        "markov": (jnp.array(config.switching), ()),
+        "immae": ((), WindowedReset(np.array(period), np.array(config.reset_threshold))),
+        "floor": ((), np.array(config.weight_floor)),
+        "markov": (np.array(config.switching), ()),
         "oracle": (),
     }
     models = len(config.theta)
-    bank = jnp.where(jnp.arange(count) < models, 0.0, -jnp.inf)
+    bank = np.where(np.arange(count) < models, 0.0, -np.inf)
     alone = {
-        "kf": jnp.where(jnp.arange(count) == models, 0.0, -jnp.inf),
-        "oracle": jnp.where(jnp.arange(count) == models + 1, 0.0, -jnp.inf),
+        "kf": np.where(np.arange(count) == models, 0.0, -np.inf),
+        "oracle": np.where(np.arange(count) == models + 1, 0.0, -np.inf),
     }
     return BankParams(members, rules, {name: alone.get(name, bank) for name in METHODS})
 

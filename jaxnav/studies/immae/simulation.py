@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.run import simulate
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_cns import (
@@ -73,89 +75,81 @@ class Run(NamedTuple):
 def noise_of(config: ImmaeConfig) -> SinsCnsParams:
     """Return the sensors' noise of Table 1, with factor one."""
     return SinsCnsParams(
-        gyro_noise=jnp.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
-        accel_noise=jnp.full(3, config.accel_noise_ug * MICRO_G),
-        star_noise=jnp.full(3, config.star_noise_arcsec * ARCSEC),
-        noise_scale=jnp.ones(()),
+        gyro_noise=np.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
+        accel_noise=np.full(3, config.accel_noise_ug * MICRO_G),
+        star_noise=np.full(3, config.star_noise_arcsec * ARCSEC),
+        noise_scale=np.ones(()),
     )
 
 
-def prior_sigma(config: ImmaeConfig) -> Array:
+def prior_sigma(config: ImmaeConfig) -> np.ndarray:
     """Return the standard deviations ``(15,)`` of P0.
 
     The paper's list of P0 has fourteen entries, one drift too few, and gives the attitude as
     (6", 10", 10") where Table 1 has deviations of (10", 6", 10"); here each block has one value.
     """
-    return jnp.repeat(
-        jnp.array(
-            [
-                config.p0_attitude_arcsec * ARCSEC,
-                config.p0_velocity,
-                config.p0_position,
-                config.p0_drift_deg_h * DEG_PER_HOUR,
-                config.p0_bias_ug * MICRO_G,
-            ]
-        ),
-        3,
-    )
+    blocks = [
+        config.p0_attitude_arcsec * ARCSEC,
+        config.p0_velocity,
+        config.p0_position,
+        config.p0_drift_deg_h * DEG_PER_HOUR,
+        config.p0_bias_ug * MICRO_G,
+    ]
+    return np.repeat(blocks, 3)
 
 
-def table_errors(config: ImmaeConfig) -> Array:
+def table_errors(config: ImmaeConfig) -> np.ndarray:
     """Return the initial error state ``(15,)`` of Table 1."""
-    s = LAYOUT
-    return (
-        jnp.zeros(15)
-        .at[s.phi]
-        .set(jnp.array(config.initial_misalignment_arcsec) * ARCSEC)
-        .at[s.eps]
-        .set(config.gyro_drift_deg_h * DEG_PER_HOUR)
-        .at[s.nabla]
-        .set(config.accel_bias_ug * MICRO_G)
-    )
+    s, error = LAYOUT, np.zeros(15)
+    error[s.phi] = np.array(config.initial_misalignment_arcsec) * ARCSEC
+    error[s.eps] = config.gyro_drift_deg_h * DEG_PER_HOUR
+    error[s.nabla] = config.accel_bias_ug * MICRO_G
+    return error
 
 
-def true_scale(config: ImmaeConfig, count: int) -> Array:
+def true_scale(config: ImmaeConfig, count: int) -> np.ndarray:
     """Return the true factor on Q0 for ``count`` equal parts of the flight ``(count,)``."""
-    thrice = 3 * jnp.arange(count)
+    thrice = 3 * np.arange(count)
     step = config.step_theta if config.scenario == "noise-step" else 1.0
-    return jnp.where((thrice >= count) & (thrice < 2 * count), step, 1.0)
+    return np.where((thrice >= count) & (thrice < 2 * count), step, 1.0)
 
 
 def build_world(config: ImmaeConfig) -> World:
     """Fly the trajectory and prepare what all runs share."""
     every = config.samples_per_step
-    samples = config.steps * every
-    radius = meridian_radius(config.latitude_deg * DEG)
+    radius = jax.jit(meridian_radius)(config.latitude_deg * DEG)
     profile = RocketProfile(pitch_start=config.initial_pitch_deg * DEG)
-    trajectory = fly(profile, steps=samples, step=config.imu_step, radius=radius)
-    step_scale = true_scale(config, config.steps)
-    epochs = jax.tree.map(lambda leaf: leaf[every::every], trajectory.state)
+    trajectory = fly(profile, steps=config.steps * every, step=config.imu_step, radius=radius)
+    scale = true_scale(config, config.steps)
+    dcm, euler_map, nominal = _at_epochs(trajectory, radius, scale, config.filter_period_s, every)
     drawn = config.initial == "drawn"
     return World(
         trajectory=trajectory,
-        dcm=epochs.dcm,
-        euler_map=jax.vmap(euler_error_from_rotation)(epochs.dcm),
-        sample_scale=jnp.repeat(step_scale, every),
-        step_scale=step_scale,
+        dcm=dcm,
+        euler_map=euler_map,
+        sample_scale=np.repeat(scale, every),
+        step_scale=scale,
         noise=noise_of(config),
         radius=radius,
-        start_mean=jnp.zeros(15) if drawn else table_errors(config),
-        start_root=jnp.diag(prior_sigma(config)) if drawn else jnp.zeros((15, 15)),
-        nominal=_nominal_inputs(trajectory, epochs, config, radius, step_scale),
+        start_mean=np.zeros(15) if drawn else table_errors(config),
+        start_root=np.diag(prior_sigma(config)) if drawn else np.zeros((15, 15)),
+        nominal=nominal,
     )
 
 
-def _nominal_inputs(
-    trajectory: Trajectory, epochs: NavState, config: ImmaeConfig, radius: Array, scale: Array
-) -> SinsCnsInput:
+@compiled(static_argnums=(3, 4))
+def _at_epochs(
+    trajectory: Trajectory, radius: Array, scale: Array, period: float, every: int
+) -> tuple[Array, Array, SinsCnsInput]:
+    """Return attitudes, their maps to Euler angles and the model's inputs on the filter's clock."""
+    epochs = jax.tree.map(lambda leaf: leaf[every::every], trajectory.state)
     start = jax.tree.map(lambda leaf: leaf[0], trajectory.state)
-    every = config.samples_per_step
     turned = jax.vmap(rotation_compensated)(trajectory.dtheta, trajectory.dvel)
     specific = jax.vmap(matmul)(trajectory.state.dcm[:-1], turned)
     gained = jnp.sum(specific.reshape(-1, every, 3), axis=1)
-    return inputs_from_solution(
-        start, NavSolution(epochs, gained), config.filter_period_s, radius, scale
-    )
+    solution = NavSolution(epochs, gained)
+    inputs = inputs_from_solution(start, solution, period, radius, scale)
+    return epochs.dcm, jax.vmap(euler_error_from_rotation)(epochs.dcm), inputs
 
 
 def fly_sins(key: Array, world: World, period: float, imu_step: float) -> Run:

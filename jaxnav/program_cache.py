@@ -1,0 +1,112 @@
+"""The compiled programs that are kept between processes: where, how many, and what spoils them.
+
+JAX keeps programs in a folder if it is given one, by default only those that took a second to
+compile and without a bound. A study has a hundred that take less, so that a second run would wait
+as long as the first: here all are kept, in a folder of their own for each jax, jaxlib and kind of
+processor, and the oldest go when the whole takes more than :data:`LIMIT_BYTES`.
+"""
+
+import hashlib
+import os
+import platform
+import sys
+import tempfile
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+LIMIT_BYTES = 512 * 2**20
+"""What the programs may take on disk, those of all versions together."""
+_SPOILED = "Error reading persistent compilation cache entry for"
+
+
+def root() -> Path:
+    """Return the folder that holds the programs of all versions and processors."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return home / "jaxnav" / "xla"
+
+
+def folder() -> Path:
+    """Return the folder for this jax, jaxlib and processor."""
+    versions = "-".join(f"{name}-{version(name)}" for name in ("jax", "jaxlib"))
+    return root() / f"{versions}-{platform.machine()}-{_processor()}"
+
+
+def _processor() -> str:
+    """Return a short name for the instructions that a program compiled here may use."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        told = next(line for line in lines if line.lower().startswith(("flags", "features")))
+    except (OSError, StopIteration):
+        told = platform.processor()
+    return hashlib.sha256(told.encode()).hexdigest()[:8]
+
+
+def prepared(limit_bytes: int = LIMIT_BYTES) -> Path | None:
+    """Return the folder for JAX to keep programs in, which it was told of or :func:`folder`.
+
+    A folder that cannot be written is warned of on standard error, and programs are then compiled
+    anew. From here on, an entry that cannot be read is told of, removed and compiled anew.
+
+    Args:
+        limit_bytes: Older programs are removed until the rest takes no more than this.
+
+    Returns:
+        The folder, or ``None`` if there is none to write to.
+    """
+    given = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    chosen = Path(given) if given else folder()
+    try:
+        chosen.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=chosen):
+            pass
+        if not given:
+            prune(limit_bytes)
+    except OSError as error:
+        _tell(f"compiled programs cannot be kept in {chosen} ({error.strerror}), so each")
+        return None
+    _remove_spoiled_entries(chosen)
+    return chosen
+
+
+def size(top: Path) -> tuple[int, int]:
+    """Return the number of programs below a folder and what they take [bytes]."""
+    sizes = [path.stat().st_size for path in _entries(top)]
+    return len(sizes), sum(sizes)
+
+
+def _entries(top: Path) -> list[Path]:
+    return list(top.glob("**/*-cache"))
+
+
+def prune(limit_bytes: int) -> None:
+    """Remove the programs that were used longest ago until the rest is within the limit."""
+    found = [(path, path.stat()) for path in _entries(root())]
+    total = sum(stat.st_size for _, stat in found)
+    for path, stat in sorted(found, key=lambda each: max(each[1].st_atime, each[1].st_mtime)):
+        if total <= limit_bytes:
+            return
+        path.unlink(missing_ok=True)
+        total -= stat.st_size
+
+
+def _remove_spoiled_entries(chosen: Path) -> None:
+    """Remove an entry when JAX warns that it cannot be read: it would never write it anew."""
+    show = warnings.showwarning
+
+    def removing(message: Warning | str, *details: Any, **more: Any) -> None:
+        text = str(message)
+        if not text.startswith(_SPOILED):
+            show(message, *details, **more)
+            return
+        name = text.removeprefix(_SPOILED).split("'")[1]
+        for path in chosen.glob(f"{name}-*-cache"):
+            path.unlink(missing_ok=True)
+        _tell(f"a damaged program, {name}, was removed from {chosen} and")
+
+    warnings.showwarning = removing
+
+
+def _tell(what: str) -> None:
+    print(f"jaxnav: warning: {what} is compiled anew", file=sys.stderr)
