@@ -99,7 +99,7 @@ def _doctor(rest: list[str]) -> int:
         print("usage: jaxnav doctor")
         return OK
     configure_jax()
-    from jaxnav.report import print_doctor
+    from jaxnav.doctor import print_doctor
 
     print_doctor()
     return OK

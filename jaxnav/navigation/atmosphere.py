@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import MEAN_RADIUS
 
 REFRACTIVITY = 2.25e-4
@@ -202,9 +203,19 @@ def tabulate(
     if not step > 0:
         raise ValueError(f"step must be positive, got {step}")
     heights = np.linspace(low, high, int(np.ceil((high - low) / step * (1 - 1e-12))) + 1)
-    angles = jax.vmap(lambda h: refraction_angle(h, radius=radius))(jnp.asarray(heights))
+    log_angles = np.log(refraction_angles(heights, radius))
     grid = heights[1] - heights[0]
-    return RefractionTable(jnp.asarray(low, float), jnp.asarray(grid, float), jnp.log(angles))
+    return RefractionTable(*(jnp.asarray(part, float) for part in (low, grid, log_angles)))
+
+
+def refraction_angles(heights: np.ndarray, radius: float = MEAN_RADIUS) -> np.ndarray:
+    """Return :func:`refraction_angle` [rad] at tangent heights ``(N,) [m]``, in one program."""
+    return np.asarray(_refraction_angles(heights, radius))
+
+
+@compiled
+def _refraction_angles(heights: Array, radius: Array) -> Array:
+    return jax.vmap(lambda h: refraction_angle(h, radius=radius))(heights)
 
 
 def table_angle(table: RefractionTable, height: Array) -> Array:

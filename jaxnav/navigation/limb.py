@@ -17,12 +17,13 @@ from jax import Array
 from jax.core import Tracer
 from scipy.interpolate import PPoly, make_lsq_spline
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.atmosphere import (
     LAYERS,
     RefractionTable,
     apparent_height,
     check_height,
-    refraction_angle,
+    refraction_angles,
     table_angle,
 )
 from jaxnav.navigation.earth import MEAN_RADIUS
@@ -163,8 +164,7 @@ def fitted_model(low: float = 20e3, high: float = 40e3, radius: float = MEAN_RAD
     # Points between all knots, as least squares needs; a spline's argument rises with the angle.
     grid = np.concatenate([np.linspace(a, b, 24)[:-1] for a, b in pairwise(steps)])
     heights = np.append(grid, high)[::-1]
-    traced = jax.vmap(lambda h: refraction_angle(h, radius=radius))(jnp.asarray(heights))
-    angles = np.asarray(traced)
+    angles = refraction_angles(heights, radius)
     # For some metres below a kink the angle falls with the height: the fit goes through the middle.
     order = np.argsort(angles)
     if np.max(np.abs(heights[order] - heights)) > 50:
@@ -176,7 +176,7 @@ def fitted_model(low: float = 20e3, high: float = 40e3, radius: float = MEAN_RAD
     x = np.log(angles / ARCSEC)
     scale_height = (high - low) / (x[-1] - x[0])
     slope = float(exponential_model(0.0, scale_height, 0.5 * (low + high), radius).slope)
-    apparent = np.asarray(apparent_height(jnp.asarray(heights), radius=radius))
+    apparent = np.asarray(compiled(apparent_height)(heights, radius=radius))
     ends = np.full(4, x[0]), np.full(4, x[-1])
     inner_x = np.interp(-inner, -heights, x)
     knots = np.concatenate([ends[0], np.sort(inner_x), ends[1]])

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.inertial import SENSORS, ImuLog, load_imu_csv, on_grid, window
 from jaxnav.navigation.sensors.allan import (
@@ -91,7 +92,7 @@ def analyse(log: ImuLog, config: AllanConfig) -> tuple[dict[str, Any], dict[str,
     rates = jnp.asarray(np.hstack([log.gyro, log.accel]).T)
     valid = None if log.valid.all() else jnp.asarray(log.valid)
     # One axis after the other: a day at 400 Hz is a quarter of a gigabyte an array.
-    each = jax.jit(lambda rates, valid: jax.lax.map(partial(one, valid=valid), rates))
+    each = compiled(lambda rates, valid: jax.lax.map(partial(one, valid=valid), rates))
     measured, fit, freedom = each(rates, valid)
     low, high = deviation_interval(measured, freedom, config.confidence)
     tau = np.asarray(measured.tau[0])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.banks.mixture import BankParams, panel
@@ -302,7 +303,7 @@ def _all_draws(
         kept = run(filter, params, drive.inputs, obs, record=record).record
         return jax.tree.map(lambda leaf: leaf[at], kept)
 
-    return jax.jit(lambda noise: jax.lax.map(one, noise, batch_size=TILE))(jnp.asarray(noise))
+    return compiled(lambda noise: jax.lax.map(one, noise, batch_size=TILE))(jnp.asarray(noise))
 
 
 def _off(model: Any, params: Any, drive: Drive, mean: Any, draw: int) -> np.ndarray:

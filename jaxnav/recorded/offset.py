@@ -1,13 +1,13 @@
 """The likeliest time offset between the receiver and the inertial sensors."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
@@ -72,7 +72,7 @@ def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
     return Offset(value, sigma, abs(step) < CLOSE_S)
 
 
-@partial(jax.jit, static_argnums=0)
+@compiled(static_argnums=0)
 def _score(filter: Filter, params: FilterParams, inputs: Any, obs: Obs) -> tuple[Array, Array]:
     """Return the derivative of the log-likelihood by the offset, and its information."""
 

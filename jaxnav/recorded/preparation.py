@@ -1,7 +1,6 @@
 """From a recorded drive to what a filter takes: inputs, observations, the state at the start."""
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 from jax import Array
 from numpy.lib.stride_tricks import sliding_window_view
 
+from jaxnav.compiling import compiled
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.datasets.inertial import ImuLog
@@ -224,7 +224,7 @@ def _sensed(imu: ImuLog, time: np.ndarray, first: int, every: int, count: int) -
     )
 
 
-@partial(jax.jit, static_argnums=4)
+@compiled(static_argnums=4)
 def _condensed(gyro: Array, accel: Array, dt: Array, valid: Array, every: int) -> SinsGnssInput:
     turned, gain = accumulate(*increments_from_rates(gyro, accel, dt, valid), every)
     period = jnp.sum(dt.reshape(-1, every), axis=1)
@@ -321,7 +321,7 @@ def _moving_start(log: DriveLog, time: np.ndarray, fix_time: np.ndarray, first: 
     return _started(log, end, int(later[0]), dcm, jnp.asarray(drift), at_rest=False)
 
 
-@jax.jit
+@compiled
 def _headed(force: Array, turns: Array, velocity: Array) -> Array:
     """Return C_nb from levelling by a force and turning after, headed as a velocity points."""
     level = align_with_heading(force, 0.0)

@@ -1,6 +1,5 @@
 """Errors of a run: against fixes, against a reference, and whether it diverged."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +8,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
+from jaxnav.compiling import compiled
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import displaced, offset_between
@@ -69,7 +69,7 @@ def fix_errors(model: Model, params: VehicleParams, drive: Drive, mean: SinsLeve
     return np.where(known, np.asarray(off), np.nan)
 
 
-@partial(jax.jit, static_argnums=0)
+@compiled(static_argnums=0)
 def _against(model: Model, params: VehicleParams, x: SinsLevel, u: VehicleInput, z: Array) -> Array:
     def one(x: SinsLevel, u: VehicleInput, z: Array) -> Array:
         return -model.residual(z, model.observe(params, x, u))[FIXES]
@@ -154,8 +154,8 @@ def against_reference(log: DriveLog, drive: Drive, kept: Kept, offset_s: float) 
     )
 
 
-_displaced = jax.jit(jax.vmap(displaced))
-_between = jax.jit(jax.vmap(offset_between))
+_displaced = compiled(jax.vmap(displaced))
+_between = compiled(jax.vmap(offset_between))
 
 
 def _attitude_errors(

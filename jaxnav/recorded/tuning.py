@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood
@@ -61,7 +62,7 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
     whole = _whole(drive)
     first = jax.tree.map(lambda leaf: leaf[:half], whole)
     params_of = partial(_params, plain, drive, log, chosen.form)
-    likelihood = jax.jit(partial(_blocks, chosen.filter, half, block))
+    likelihood = compiled(partial(_blocks, chosen.filter, half, block))
 
     def loss(values: Values, part: Half) -> Array:
         return negative_log_likelihood(

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+from jaxnav.compiling import accepted_options, compiled
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, Obs
 
@@ -50,10 +51,10 @@ def step_latency(filter: Filter, params: Any, inputs: Any, observations: Obs) ->
     """
     last = jax.tree.map(lambda leaf: leaf[-1], (inputs, observations))
     valid = last[1].valid
-    state, unpack_state = ravel_pytree(jax.jit(filter.init)(params))
+    state, unpack_state = ravel_pytree(compiled(filter.init)(params))
     data, unpack_data = ravel_pytree((last[0], last[1].z))
 
-    @partial(jax.jit, donate_argnums=0)
+    @partial(jax.jit, donate_argnums=0, compiler_options=accepted_options())
     def step(packed: Array, data: Array, valid: Array) -> Array:
         u, z = unpack_data(data)
         predicted = filter.predict(params, unpack_state(packed), u)
@@ -111,10 +112,11 @@ def microseconds_per_step(filter: Filter, params: Any, inputs: Any, observations
         return trace.record
 
     given = (params, inputs, observations)
-    compiled = jax.jit(jax.vmap(one)).lower(*given).compile()
+    batch = compiled(jax.vmap(one))
+    jax.block_until_ready(batch(*given))
     best = float("inf")
     for _ in range(REPEATS):
         begin = time.perf_counter()
-        jax.block_until_ready(compiled(*given))
+        jax.block_until_ready(batch(*given))
         best = min(best, time.perf_counter() - begin)
     return 1e6 * best / observations.z[..., 0].size

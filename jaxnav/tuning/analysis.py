@@ -8,6 +8,7 @@ import numpy as np
 import optax
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.metrics import Interval, mean, mean_interval, rmse, rmse_ratio
 from jaxnav.estimation.tune.fit import Fit, StartError, Validation, fit, fit_lbfgs
 from jaxnav.estimation.tune.inspect import (
@@ -119,8 +120,8 @@ def _losses(problem: Problem, keys: list[Any], config: TuneConfig) -> _Losses:
         data = problem.draw(keys[VALIDATE], _validation_runs(problem, config))
     else:
         data = problem.draw(keys[TRAIN], 1)
-    hard = None if problem.hard is None else jax.jit(problem.hard)
-    return _Losses(jax.jit(problem.loss), hard, data)
+    hard = None if problem.hard is None else compiled(problem.hard)
+    return _Losses(compiled(problem.loss), hard, data)
 
 
 def _validation_runs(problem: Problem, config: TuneConfig) -> int:

@@ -10,6 +10,7 @@ import optax
 import scipy.optimize
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.tune.transforms import POSITIVE, Coordinates, coordinates
 
 Progress = Callable[[int, int, float], None]
@@ -152,7 +153,7 @@ class _Improvement(NamedTuple):
 
 
 def _improvement(optimiser: optax.GradientTransformation) -> _Improvement:
-    @jax.jit
+    @compiled
     def update(gradient: Array, memory: Any, point: Array) -> tuple[Array, Any]:
         # optax mixes integer counts with floats, whatever the caller's promotion rules are.
         with jax.numpy_dtype_promotion("standard"):
@@ -173,7 +174,7 @@ def _evaluation(
     def at(point: Array, given: tuple[Any, ...]) -> Array:
         return loss(free.constrain(point), *given)
 
-    graded = jax.jit(value_and_gradient(at, mode))
+    graded = compiled(value_and_gradient(at, mode))
 
     def evaluate(point: Array, number: int) -> tuple[float, Array]:
         value, gradient = graded(point, data(number))
@@ -211,8 +212,8 @@ def value_and_gradient(
 
 
 def _check(validation: Validation, free: Coordinates) -> Callable[[Array], float]:
-    compiled = jax.jit(lambda point, data: validation.loss(free.constrain(point), *data))
-    return lambda point: float(compiled(point, validation.data))
+    program = compiled(lambda point, data: validation.loss(free.constrain(point), *data))
+    return lambda point: float(program(point, validation.data))
 
 
 def _require_start(value: float, gradient: Array, start: Any) -> None:

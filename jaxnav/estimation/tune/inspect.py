@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.tune.fit import value_and_gradient
 from jaxnav.estimation.tune.transforms import POSITIVE, Coordinates, coordinates
 
@@ -66,10 +67,10 @@ def check_gradient(
 def _graded(
     loss: Callable[..., Array], free: Coordinates, data: tuple[Any, ...], mode: str
 ) -> Callable[[Array], tuple[Array, Array]]:
-    compiled = jax.jit(
+    program = compiled(
         value_and_gradient(lambda point, data: loss(free.constrain(point), *data), mode)
     )
-    return lambda point: compiled(point, data)
+    return lambda point: program(point, data)
 
 
 class Profile(NamedTuple):
@@ -110,11 +111,11 @@ def profile(
     """
     free = coordinates(params, transform)
     offset = np.linspace(-width, width, points)
-    compiled = jax.jit(lambda point, data: loss(free.constrain(point), *data))
-    behind = jax.jit(free.values)
+    program = compiled(lambda point, data: loss(free.constrain(point), *data))
+    behind = compiled(free.values)
     directions = np.eye(free.start.size)
     around = [[free.start + o * d for o in offset] for d in directions]
-    losses = np.array([[float(compiled(point, data)) for point in row] for row in around])
+    losses = np.array([[float(program(point, data)) for point in row] for row in around])
     values = np.array([[behind(point)[i] for point in row] for i, row in enumerate(around)])
     return Profile(free.labels, offset, values, losses)
 
@@ -176,6 +177,6 @@ def fisher(
             + ", ".join(free.labels)
         )
     covariance = np.linalg.inv(information)
-    slope = jax.jit(jax.jacfwd(free.constrain))(free.start)
+    slope = compiled(jax.jacfwd(free.constrain))(free.start)
     sigma = jax.tree.map(lambda J: np.sqrt(np.einsum("...i,ij,...j->...", J, covariance, J)), slope)
     return Uncertainty(free.labels, covariance, sigma)

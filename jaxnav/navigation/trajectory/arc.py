@@ -3,10 +3,10 @@
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import WGS84, Earth
 from jaxnav.navigation.trajectory.base import Trajectory, smooth_step
 from jaxnav.navigation.trajectory.level import Motion, fall
@@ -93,7 +93,7 @@ def specific_force(profile: ArcProfile, time: Array, at: Motion) -> Array:
     return (thrust - drag) * jnp.array([1.0, 0.0, 0.0], velocity.dtype)
 
 
-@partial(jax.jit, static_argnames=("steps", "step"))
+@compiled(static_argnames=("steps", "step"))
 def fly_arc(profile: ArcProfile, *, steps: int, step: float, earth: Earth = WGS84) -> Trajectory:
     """Integrate the motion of the point mass and derive the perfect increments of its sensors.
 

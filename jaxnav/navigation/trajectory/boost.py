@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import GM, gravity_launch_inertial
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.trajectory.base import Trajectory, simpson, smooth_step
@@ -102,7 +103,7 @@ def _specific_force(
     return acceleration - matmul(_attitude(profile, time).T, gravity)
 
 
-@partial(jax.jit, static_argnames=("steps", "step"))
+@compiled(static_argnames=("steps", "step"))
 def fly_boost(
     profile: BoostProfile, *, steps: int, step: float, radius: Array | float
 ) -> Trajectory:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import gravity_launch_inertial
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.trajectory.base import Trajectory, simpson, smooth_step
@@ -70,7 +71,7 @@ def axial_force(profile: RocketProfile, time: Array) -> Array:
     return boost * (1 - smooth_step((time - p.burn_time) / p.cutoff_time))
 
 
-@partial(jax.jit, static_argnames=("steps", "step"))
+@compiled(static_argnames=("steps", "step"))
 def fly(profile: RocketProfile, *, steps: int, step: float, radius: Array | float) -> Trajectory:
     """Integrate the motion of the point mass and derive the perfect increments of its sensors.
 

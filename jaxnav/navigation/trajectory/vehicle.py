@@ -4,8 +4,10 @@ from itertools import cycle
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import WGS84, Earth
 from jaxnav.navigation.trajectory.base import Trajectory, smooth_step
 from jaxnav.navigation.trajectory.level import follow
@@ -81,7 +83,16 @@ def drive(profile: VehicleProfile, *, steps: int, step: float, earth: Earth = WG
         The trajectory with perfect increments, as
         :func:`~jaxnav.navigation.trajectory.level.follow`.
     """
-    duration, speed, turn = (jnp.array(column, float) for column in zip(*profile.legs, strict=True))
+    legs = np.array(profile.legs, float).T
+    return _drive(profile._replace(legs=()), legs, earth, steps=steps, step=step)
+
+
+@compiled(static_argnames=("steps", "step"))
+def _drive(
+    profile: VehicleProfile, legs: Array, earth: Earth, *, steps: int, step: float
+) -> Trajectory:
+    """Drive a profile whose legs are columns ``(3, L)``."""
+    duration, speed, turn = legs
     ends = jnp.cumsum(duration)
     before = jnp.concatenate([jnp.zeros(1), speed[:-1]])
     turned = profile.heading + jnp.concatenate([jnp.zeros(1), jnp.cumsum(turn)[:-1]])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.mismatch import Mismatch, MismatchState, mismatched
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, Obs
@@ -76,7 +77,9 @@ def ratio_map(config: ArekfConfig) -> RatioMap:
         return run(filter, params, inputs, nothing, record=_norms).record
 
     over_factors = jax.vmap(squares, in_axes=(None, None, 0))
-    found = np.asarray(jax.jit(jax.vmap(over_factors, in_axes=(0, 0, None)))(truth, sigma, factors))
+    found = np.asarray(
+        compiled(jax.vmap(over_factors, in_axes=(0, 0, None)))(truth, sigma, factors)
+    )
     durations = [*(at for at in DURATIONS_S if at < config.duration_s), config.duration_s]
     steps = [round(at / config.filter_period_s) for at in durations]
     level = np.sqrt(np.stack([found[:, :, :k].mean(axis=2) for k in steps], axis=2))
@@ -93,7 +96,7 @@ def _norms(state: MismatchState, info: Any) -> Array:
 def _path(config: ArekfConfig) -> tuple[PathInput, Array]:
     """Return the true path as inputs of each step, and which steps have a fix ``(K, 6)``."""
     motion, every = build_world(config).trajectory, config.samples_per_step
-    dtheta, gain = jax.jit(accumulate, static_argnums=2)(motion.dtheta, motion.dvel, every)
+    dtheta, gain = compiled(accumulate, static_argnums=2)(motion.dtheta, motion.dvel, every)
     none = jnp.zeros(3)
     states = true_states(motion, every, none, none)
     before, after = (

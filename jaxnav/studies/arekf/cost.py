@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, mmae
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.types import Filter, FilterParams
@@ -23,7 +24,7 @@ def step_latencies(config: ArekfConfig) -> dict[str, Latency]:
     """Return the latency of a single compiled step of each method, prediction and update."""
     world = build_world(config)
     shared = shared_of(config, world, config.reported)
-    flight = jax.jit(fly_run, static_argnames="timing")(
+    flight = compiled(fly_run, static_argnames="timing")(
         jax.random.key(config.seed), world, timing=timing_of(config)
     )
     single = FilterParams(shared.given, flight.start)

@@ -100,10 +100,10 @@ def shared_of(config: ArekfConfig, world: World, factor: float) -> Shared:
     given = world.noise._replace(
         gyro_noise=world.noise.gyro_noise / factor, accel_noise=world.noise.accel_noise / factor
     )
-    kernel = Versoria(jnp.array(config.versoria_width), jnp.array(config.versoria_power))
-    adaptation = Adaptation(*(jnp.array(x) for x in Adaptation(config.iae_memory)))
+    kernel = Versoria(np.array(config.versoria_width), np.array(config.versoria_power))
+    adaptation = Adaptation(*(np.array(x) for x in Adaptation(config.iae_memory)))
     late = config.scenario == "large-heading-error"
-    settle = jnp.array(config.settle_s if late else 0.0)
+    settle = np.array(config.settle_s if late else 0.0)
     return Shared(world, given, kernel, adaptation, settle)
 
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxnav.estimation.types import Gaussian, Obs
@@ -83,19 +84,19 @@ def noise_of(sensor: Sensor, position: float) -> SinsGnssParams:
         sensor: The grade.
         position: Standard deviation of a GNSS position [m].
     """
-    none = jnp.zeros(3)
+    none = np.zeros(3)
     return SinsGnssParams(
-        gyro_noise=jnp.full(3, sensor.arw * DEG_PER_SQRT_HOUR),
-        accel_noise=jnp.full(3, sensor.vrw / HOUR**0.5),
+        gyro_noise=np.full(3, sensor.arw * DEG_PER_SQRT_HOUR),
+        accel_noise=np.full(3, sensor.vrw / HOUR**0.5),
         gyro_walk=none,
         accel_walk=none,
-        velocity_noise=jnp.full(3, sensor.velocity),
-        position_noise=jnp.full(3, position),
+        velocity_noise=np.full(3, sensor.velocity),
+        position_noise=np.full(3, position),
         lever_arm=none,
     )
 
 
-def prior_sigma(config: ArekfConfig, sensor: Sensor) -> Array:
+def prior_sigma(config: ArekfConfig, sensor: Sensor) -> np.ndarray:
     """Return the standard deviations ``(15,)`` at launch with a grade of sensors."""
     east, north, up = config.p0_attitude_deg
     heading = config.heading_deg if config.scenario == "large-heading-error" else up
@@ -105,9 +106,7 @@ def prior_sigma(config: ArekfConfig, sensor: Sensor) -> Array:
         sensor.drift * DEG_PER_HOUR,
         sensor.bias * 1e3 * MICRO_G,
     )
-    return jnp.concatenate(
-        [jnp.array([east, north, heading]) * DEG, jnp.repeat(jnp.array(others), 3)]
-    )
+    return np.concatenate([np.array([east, north, heading]) * DEG, np.repeat(np.array(others), 3)])
 
 
 def build_world(config: ArekfConfig) -> World:
@@ -121,8 +120,8 @@ def build_world(config: ArekfConfig) -> World:
         fixes=GnssErrors(
             noise.velocity_noise,
             noise.position_noise,
-            jnp.array(config.outlier_share if spoiled else 0.0),
-            jnp.array(config.outlier_scale),
+            np.array(config.outlier_share if spoiled else 0.0),
+            np.array(config.outlier_scale),
         ),
         prior_sigma=prior_sigma(config, config.sensor),
     )

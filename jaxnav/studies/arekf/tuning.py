@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.robust import Versoria
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
@@ -105,7 +106,7 @@ def spoiled(key: Array, world: World) -> World:
     )
 
 
-@partial(jax.jit, static_argnums=(0, 3))
+@compiled(static_argnums=(0, 3))
 def _draw(timing: Timing, world: World, key: Array, runs: int) -> Flights:
     def one(key: Array) -> Flights:
         world_key, key = jax.random.split(key)

@@ -117,7 +117,7 @@ def true_scale(config: ImmaeConfig, count: int) -> np.ndarray:
 def build_world(config: ImmaeConfig) -> World:
     """Fly the trajectory and prepare what all runs share."""
     every = config.samples_per_step
-    radius = jax.jit(meridian_radius)(config.latitude_deg * DEG)
+    radius = compiled(meridian_radius)(config.latitude_deg * DEG)
     profile = RocketProfile(pitch_start=config.initial_pitch_deg * DEG)
     trajectory = fly(profile, steps=config.steps * every, step=config.imu_step, radius=radius)
     scale = true_scale(config, config.steps)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, bank, panel
 from jaxnav.estimation.banks.weights import (
     WindowedReset,
@@ -67,7 +68,7 @@ def noise_loss(config: ImmaeConfig, key: Array, runs: int) -> Callable[[Array], 
     """
     period, imu_step = config.filter_period_s, config.imu_step
     world = build_world(config)
-    simulate = jax.jit(jax.vmap(lambda key: fly_linear(key, world, period, imu_step).z))
+    simulate = compiled(jax.vmap(lambda key: fly_linear(key, world, period, imu_step).z))
     flights = simulate(jax.random.split(key, runs))
     sigma = prior_sigma(config)
     sigma = jnp.concatenate([sigma[LAYOUT.phi], sigma[LAYOUT.eps]])
@@ -167,7 +168,7 @@ def _parameters(config: ImmaeConfig) -> dict[str, Parameter]:
     }
 
 
-@partial(jax.jit, static_argnums=(0, 3))
+@compiled(static_argnums=(0, 3))
 def _draw(config: ImmaeConfig, world: World, key: Array, runs: int) -> Flights:
     def one(key: Array) -> tuple[Array, Array]:
         noise_key, key = jax.random.split(key)

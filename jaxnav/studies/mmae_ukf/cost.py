@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.imm import imm
 from jaxnav.estimation.banks.mixture import BankParams, immae, mmae
 from jaxnav.estimation.filters.kalman import ekf
@@ -47,7 +48,7 @@ def step_costs(config: MmaeUkfConfig) -> dict[str, float]:
     world, setup = build_world(config), setup_of(config)
     shared = shared_of(config, world)
     keys = jax.random.split(jax.random.key(config.seed), RUNS)
-    flights = jax.jit(
+    flights = compiled(
         jax.vmap(lambda key: fly(key, world, setup.period, setup.imu_step, setup.star))
     )(keys)
     observations = Obs(flights.z, jnp.ones(flights.z.shape, bool))

@@ -155,7 +155,7 @@ def shared_of(config: MmaeUkfConfig, world: World) -> Shared:
     nominal = np.ones((1, 2))
     models = config.models
     period = config.reset_period_s / config.filter_period_s
-    reset = WindowedReset(jnp.array(period), jnp.array(config.reset_threshold))
+    reset = WindowedReset(np.array(period), np.array(config.reset_threshold))
     bank, alone, told = (_prior(models + 2, chosen) for chosen in (range(models), [-2], [-1]))
     return Shared(
         world=world,
@@ -173,9 +173,11 @@ def shared_of(config: MmaeUkfConfig, world: World) -> Shared:
     )
 
 
-def _prior(count: int, chosen: Any) -> Array:
+def _prior(count: int, chosen: Any) -> np.ndarray:
     """Return log-weights ``(count,)`` that leave all but the chosen members out."""
-    return jnp.full(count, -jnp.inf).at[jnp.array(list(chosen))].set(0.0)
+    prior = np.full(count, -np.inf)
+    prior[list(chosen)] = 0.0
+    return prior
 
 
 def _members(
@@ -185,13 +187,13 @@ def _members(
     count = factors.shape[0]
     noise = noise_of(config)
     scaled = replicate(noise, count)._replace(
-        gyro_noise=jnp.array(factors[:, :1]) * noise.gyro_noise[None],
-        accel_noise=jnp.array(factors[:, 1:]) * noise.accel_noise[None],
+        gyro_noise=np.array(factors[:, :1]) * noise.gyro_noise[None],
+        accel_noise=np.array(factors[:, 1:]) * noise.accel_noise[None],
     )
     # The state that the members start from differs from run to run.
-    anywhere = SinsTotal(jnp.eye(3), *(jnp.zeros(3) for _ in range(4)))
-    initial = replicate(Gaussian(anywhere, jnp.diag(world.prior_sigma**2)), count)
-    last = jnp.arange(count) == count - 1
+    anywhere = SinsTotal(np.eye(3), *(np.zeros(3) for _ in range(4)))
+    initial = replicate(Gaussian(anywhere, np.diag(world.prior_sigma**2)), count)
+    last = np.arange(count) == count - 1
     return Member(FilterParams(scaled, initial), last & told)
 
 

@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import (
@@ -66,27 +68,27 @@ class Run(NamedTuple):
 
 def launch_radius(config: MmaeUkfConfig) -> float:
     """Return the radius of the Earth [m]: the meridian's radius of curvature."""
-    return float(meridian_radius(config.latitude_deg * DEG))
+    return float(compiled(meridian_radius)(config.latitude_deg * DEG))
 
 
 def noise_of(config: MmaeUkfConfig) -> SinsTotalParams:
     """Return the nominal noise of the sensors."""
     return SinsTotalParams(
-        gyro_noise=jnp.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
-        accel_noise=jnp.full(3, config.accel_noise_ug * MICRO_G),
-        bias_sigma=jnp.array(config.accel_error_ug * MICRO_G),
-        bias_time=jnp.array(config.accel_error_time_s),
-        star_noise=jnp.full(3, config.star_noise_arcsec * ARCSEC),
+        gyro_noise=np.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
+        accel_noise=np.full(3, config.accel_noise_ug * MICRO_G),
+        bias_sigma=np.array(config.accel_error_ug * MICRO_G),
+        bias_time=np.array(config.accel_error_time_s),
+        star_noise=np.full(3, config.star_noise_arcsec * ARCSEC),
     )
 
 
-def prior_sigma(config: MmaeUkfConfig) -> Array:
+def prior_sigma(config: MmaeUkfConfig) -> np.ndarray:
     """Return the standard deviations ``(15,)`` of P0."""
     attitude = config.p0_attitude_arcsec * ARCSEC
     if config.scenario == "large-misalignment":
         attitude = config.misalignment_deg * DEG / 3**0.5
-    return jnp.repeat(
-        jnp.array(
+    return np.repeat(
+        np.array(
             [
                 attitude,
                 config.p0_velocity,
@@ -99,10 +101,10 @@ def prior_sigma(config: MmaeUkfConfig) -> Array:
     )
 
 
-def true_scale(config: MmaeUkfConfig) -> Array:
+def true_scale(config: MmaeUkfConfig) -> np.ndarray:
     """Return the true factor on the noise variances at each filter step ``(K,)``."""
-    third = 3 * jnp.arange(config.steps) // config.steps
-    return jnp.array(config.schedule)[third] ** 2
+    third = 3 * np.arange(config.steps) // config.steps
+    return np.array(config.schedule)[third] ** 2
 
 
 def build_world(config: MmaeUkfConfig) -> World:
@@ -118,12 +120,12 @@ def build_world(config: MmaeUkfConfig) -> World:
     large = config.scenario == "large-misalignment"
     return World(
         trajectory=trajectory,
-        epochs=jax.tree.map(lambda leaf: leaf[every::every], trajectory.state),
-        sample_scale=jnp.repeat(step_scale, every),
+        epochs=jax.tree.map(lambda leaf: np.asarray(leaf)[every::every], trajectory.state),
+        sample_scale=np.repeat(step_scale, every),
         step_scale=step_scale,
         noise=noise_of(config),
         prior_sigma=prior_sigma(config),
-        misalignment=jnp.array(config.misalignment_deg * DEG if large else 0.0),
+        misalignment=np.array(config.misalignment_deg * DEG if large else 0.0),
     )
 
 

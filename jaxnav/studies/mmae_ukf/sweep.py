@@ -51,8 +51,9 @@ def settling_times(config: MmaeUkfConfig) -> np.ndarray:
     for i, form in enumerate(FORMS):
         one = _run_one(setup_of(config)._replace(star=form))
         for j, angle in enumerate(ANGLES_DEG):
-            sigma = short.prior_sigma.at[LAYOUT.phi].set(angle * DEG / 3**0.5)
-            turned = short._replace(prior_sigma=sigma, misalignment=jnp.array(angle * DEG))
+            sigma = short.prior_sigma.copy()
+            sigma[LAYOUT.phi] = angle * DEG / 3**0.5
+            turned = short._replace(prior_sigma=sigma, misalignment=np.array(angle * DEG))
             settled = monte_carlo(one, key, config.runs, turned).rows
             times[i, j] = config.filter_period_s * settled.T
     return times

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, bank, panel
 from jaxnav.estimation.banks.weights import WindowedReset, bayes, chain, windowed_reset
 from jaxnav.estimation.filters.sigma_point import ukf
@@ -134,7 +135,7 @@ def levels(key: Array, steps: int) -> Array:
     return LEVEL ** (2 * level[span])
 
 
-@partial(jax.jit, static_argnums=(0, 3))
+@compiled(static_argnums=(0, 3))
 def _draw(setup: Setup, world: World, key: Array, runs: int) -> Flights:
     every = round(setup.period / setup.imu_step)
 

@@ -4,6 +4,7 @@ from functools import partial
 
 import jax
 
+from jaxnav.compiling import compiled
 from jaxnav.studies.rkcns.config import RkcnsConfig
 from jaxnav.studies.rkcns.methods import filters, problem_of, setup_of, shared_of
 from jaxnav.studies.rkcns.simulation import build_world, fly_run
@@ -18,10 +19,10 @@ def step_costs(config: RkcnsConfig) -> dict[str, float]:
     setup = setup_of(config)
     shared = shared_of(config, build_world(config))
     keys = jax.random.split(jax.random.key(config.seed), RUNS)
-    flights = jax.jit(jax.vmap(partial(fly_run, world=shared.world, timing=setup.timing)))(keys)
+    flights = compiled(jax.vmap(partial(fly_run, world=shared.world, timing=setup.timing)))(keys)
 
     def timed(name: str) -> float:
-        given = jax.jit(jax.vmap(lambda flight: problem_of(name, flight, shared)))(flights)
+        given = compiled(jax.vmap(lambda flight: problem_of(name, flight, shared)))(flights)
         return microseconds_per_step(filters(setup)[name], *given)
 
     return {name: timed(name) for name in TIMED}

@@ -113,11 +113,11 @@ def shared_of(config: RkcnsConfig, world: World) -> Shared:
         star_noise=noise.star_noise,
         refraction_noise=world.refraction_noise,
         density_sigma=world.density_error,
-        disturbance=jnp.array(0.0),
+        disturbance=np.array(0.0),
         atmosphere=believed_atmosphere(config, world.atmosphere),
     )
-    exact = limb._replace(atmosphere=world.atmosphere, density_sigma=jnp.array(0.0))
-    return Shared(world, limb, exact, Search(spread=jnp.array(config.spread)))
+    exact = limb._replace(atmosphere=world.atmosphere, density_sigma=np.array(0.0))
+    return Shared(world, limb, exact, Search(spread=np.array(config.spread)))
 
 
 def believed_atmosphere(config: RkcnsConfig, table: RefractionTable) -> HeightModel:

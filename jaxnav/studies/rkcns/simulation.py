@@ -1,12 +1,14 @@
 """Flights of the study: the truth that all runs share, and one run as the filters see it."""
 
-from functools import cache, partial
+from functools import cache
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.datasets.stars import load_stars
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
@@ -120,21 +122,21 @@ def noise_of(config: RkcnsConfig) -> SinsTotalParams:
     per_sample = config.imu_step**-0.5
     walk = config.random_walk * DEG_PER_SQRT_HOUR * per_sample
     return SinsTotalParams(
-        gyro_noise=jnp.full(3, walk),
-        accel_noise=jnp.full(3, config.accel_noise_ug_sqrt_hz * MICRO_G * per_sample),
-        bias_sigma=jnp.array(config.accel_bias_ug * MICRO_G),
-        bias_time=jnp.array(jnp.inf),
-        star_noise=jnp.full(3, config.star_noise_arcsec * ARCSEC),
+        gyro_noise=np.full(3, walk),
+        accel_noise=np.full(3, config.accel_noise_ug_sqrt_hz * MICRO_G * per_sample),
+        bias_sigma=np.array(config.accel_bias_ug * MICRO_G),
+        bias_time=np.array(np.inf),
+        star_noise=np.full(3, config.star_noise_arcsec * ARCSEC),
     )
 
 
-def prior_sigma(config: RkcnsConfig) -> Array:
+def prior_sigma(config: RkcnsConfig) -> np.ndarray:
     """Return the standard deviations ``(15,)`` at launch."""
-    return jnp.concatenate(
+    return np.concatenate(
         [
-            jnp.array(config.p0_attitude_arcsec) * ARCSEC,
-            jnp.repeat(
-                jnp.array(
+            np.array(config.p0_attitude_arcsec) * ARCSEC,
+            np.repeat(
+                np.array(
                     [
                         config.p0_velocity,
                         config.p0_position,
@@ -164,10 +166,10 @@ def build_world(config: RkcnsConfig) -> World:
         limb=find_stars(config, atmosphere, epochs),
         atmosphere=atmosphere,
         noise=noise_of(config),
-        refraction_noise=jnp.array(config.refraction_noise * ARCSEC),
-        density_error=jnp.array(config.density_error),
+        refraction_noise=np.array(config.refraction_noise * ARCSEC),
+        density_error=np.array(config.density_error),
         prior_sigma=prior_sigma(config),
-        lost=jnp.array(config.lost),
+        lost=np.array(config.lost),
     )
 
 
@@ -202,7 +204,7 @@ def find_stars(config: RkcnsConfig, atmosphere: RefractionTable, positions: Arra
     return limb._replace(seen=limb.seen & (jnp.arange(slots) < config.stars)[None])
 
 
-@partial(jax.jit, static_argnums=0)
+@compiled(static_argnums=0)
 def _choose(
     slots: int,
     atmosphere: RefractionTable,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import rmse, step_means, weigh
@@ -81,7 +82,7 @@ def problem(config: RkcnsConfig) -> Problem:
     )
 
 
-@partial(jax.jit, static_argnums=(0, 3))
+@compiled(static_argnums=(0, 3))
 def _draw(setup: Setup, shared: Shared, key: Array, runs: int) -> Flights:
     def one(key: Array) -> Flights:
         flight = fly_run(key, shared.world, setup.timing)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxnav.estimation.banks.mixture import BankParams, PanelState, panel
@@ -132,7 +133,7 @@ def _members(config: SageHusaConfig) -> list[_Member]:
     """
     believed, law = config.vrw_believed, SageHusa(prior_count=config.prior_count)
     law = law._replace(low=config.clamp[0], high=config.clamp[1])
-    still = law._replace(forgetting=1.0, prior_count=jnp.inf)
+    still = law._replace(forgetting=1.0, prior_count=np.inf)
     members = [
         _Member(
             believed,
@@ -150,7 +151,7 @@ def _members(config: SageHusaConfig) -> list[_Member]:
     for vrw, name in zip((believed, config.true_vrw), ORACLES, strict=True):
         members.append(_Member(vrw, 1.0, 1.0, 1.0, still, (name,)))
     for b in config.forgetting:
-        own = law._replace(forgetting=b, prior_count=jnp.inf)
+        own = law._replace(forgetting=b, prior_count=np.inf)
         members.append(_Member(believed, 1.0, config.start_r, 0.0, own, (constant(b),)))
     return members
 
@@ -166,7 +167,7 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
         config.decay_least,
     )
     growing = Penalty(config.penalty_scale, config.penalty_exponent)
-    bound = jnp.array(config.weight_floor)
+    bound = np.array(config.weight_floor)
     rules: dict[str, Any] = dict.fromkeys(names, ()) | {
         "exponential-decay": _arrays(decaying),
         "proposed": _arrays(growing),
@@ -174,7 +175,7 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
         "proposed-bayes-floor": ((), bound),
     }
     log_priors = {
-        name: jnp.where(jnp.array([name in member.methods for member in listed]), 0.0, -jnp.inf)
+        name: np.where(np.array([name in member.methods for member in listed]), 0.0, -np.inf)
         for name in names
     }
     return Shared(
@@ -182,7 +183,7 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
         members_of(config),
         rules,
         log_priors,
-        jnp.array([*config.intervals_s, *WINDOWS_S]),
+        np.array([*config.intervals_s, *WINDOWS_S]),
     )
 
 
@@ -201,24 +202,24 @@ def members_of(config: SageHusaConfig) -> tuple[DriveParams, SageHusa]:
 def _params_of(config: SageHusaConfig, member: _Member) -> DriveParams:
     """Return the model's parameters of a member; in Experiment 1 all of R starts wrong."""
     noise = noise_of(config, member.vrw)
-    horizontal = jnp.array([1.0, 1.0, 0.0])
+    horizontal = np.array([1.0, 1.0, 0.0])
     wrong = any(name == constant(b) for b in config.forgetting for name in member.methods)
-    grown = jnp.sqrt(member.r_scale)
+    grown = np.sqrt(member.r_scale)
     position = grown if wrong else 1 + (grown - 1) * horizontal
     own = noise._replace(
-        accel_noise=noise.accel_noise * jnp.sqrt(member.q_scale),
+        accel_noise=noise.accel_noise * np.sqrt(member.q_scale),
         position_noise=noise.position_noise * position,
         velocity_noise=noise.velocity_noise * (grown if wrong else 1.0),
     )
-    return DriveParams(own, jnp.array(member.knows))
+    return DriveParams(own, np.array(member.knows))
 
 
 def _arrays(numbers: Any) -> Any:
-    return jax.tree.map(jnp.asarray, numbers)
+    return jax.tree.map(np.asarray, numbers)
 
 
 def _stacked(trees: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 @cache

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, float0
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, rewatch
 from jaxnav.estimation.banks.weights import Floor, Penalty, chain, fixed, floor, penalty
 from jaxnav.estimation.filters.kalman import ekf
@@ -136,7 +137,7 @@ def three_spells(steps: int) -> Array:
     )
 
 
-@partial(jax.jit, static_argnums=(0, 3))
+@compiled(static_argnums=(0, 3))
 def _draw(config: SageHusaConfig, world: World, key: Array, runs: int) -> Run:
     def one(key: Array) -> Run:
         noise_key, key = jax.random.split(key)
