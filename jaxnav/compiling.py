@@ -12,19 +12,23 @@ from functools import cache, partial, wraps
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
-OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+host: Any = np
+"""NumPy, for the numbers that a program is given: to make them compiles nothing. Typed as anything,
+since its arrays stand where annotations name those of JAX."""
+OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 """Options of the compiler that are taken where they exist."""
 
 
-@cache
-def accepted_options() -> dict[str, bool]:
+def accepted_options() -> dict[str, Any]:
     """Return those of :data:`OPTIONS` that the jaxlib at hand takes; starts the backend."""
     return {name: value for name, value in OPTIONS.items() if _is_accepted(name, value)}
 
 
-def _is_accepted(name: str, value: bool) -> bool:
+@cache
+def _is_accepted(name: str, value: Any) -> bool:
     try:
         jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
@@ -47,12 +51,13 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Call
     inner = jax.jit(function, **options)
 
     @cache
-    def outermost() -> Callable[..., Any]:
-        return jax.jit(function, compiler_options=accepted_options(), **options)
+    def outermost(*accepted: tuple[str, Any]) -> Callable[..., Any]:
+        return jax.jit(function, compiler_options=dict(accepted), **options)
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return (outermost() if _at_top_level() else inner)(*args, **kwargs)
+        chosen = outermost(*accepted_options().items()) if _at_top_level() else inner
+        return chosen(*args, **kwargs)
 
     return call
 

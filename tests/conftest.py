@@ -10,8 +10,11 @@ from typing import Any
 import jax
 import pytest
 
+from jaxnav import compiling
 from jaxnav.cli import configure_jax
 from jaxnav.datasets.base import DataError
+
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
@@ -26,6 +29,19 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["XDG_CACHE_HOME"] = folder
     configure_jax()
+
+
+@pytest.fixture
+def quick_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the optimiser out: a third of the time to compile, three times that to run."""
+    monkeypatch.setattr(compiling, "OPTIONS", compiling.OPTIONS | QUICK)
+
+
+@pytest.fixture(autouse=True)
+def all_but_slow_tests_compile_quickly(request: pytest.FixtureRequest) -> None:
+    """Slow tests that compile more than they run ask for it themselves."""
+    if request.node.get_closest_marker("slow") is None:
+        request.getfixturevalue("quick_programs")
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -14,10 +14,10 @@ def compilations() -> Iterator[list[float]]:
     """Return a list that gets the seconds of each program compiled, or read from a cache."""
     seconds: list[float] = []
 
-    def note(event: str, duration: float, **details: Any) -> None:
-        del details
+    def note(event: str, duration_secs: float, **kwargs: Any) -> None:
+        del kwargs
         if event == COMPILED:
-            seconds.append(duration)
+            seconds.append(duration_secs)
 
     jax.monitoring.register_event_duration_secs_listener(note)
     try:

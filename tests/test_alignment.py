@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.alignment import (
     align_with_heading,
     course_heading,
@@ -59,7 +60,7 @@ def test_levelling_with_a_heading_is_exact_for_any_body_axes() -> None:
     force, _ = still(C, LATITUDES)
     for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)):
         heading = heading_of(C, np.array(axis))
-        found = jax.jit(jax.vmap(lambda f, h, axis=axis: align_with_heading(f, h, axis)))
+        found = compiled(jax.vmap(lambda f, h, axis=axis: align_with_heading(f, h, axis)))
         np.testing.assert_allclose(found(force, heading), C, rtol=0, atol=2e-14)
         np.testing.assert_allclose(found(7 * force, heading), C, rtol=0, atol=2e-14)
 
@@ -69,7 +70,7 @@ def test_bias_tilts_by_its_ratio_to_gravity() -> None:
     force, _ = still(C, LATITUDES)
     bias = 1e-5 * GRAVITY * np.random.default_rng(2).normal(size=(40, 3))
     heading = heading_of(C, np.eye(3)[0])
-    found = np.asarray(jax.jit(jax.vmap(align_with_heading))(force + bias, heading))
+    found = np.asarray(compiled(jax.vmap(align_with_heading))(force + bias, heading))
     tilt = vector(found @ C.transpose(0, 2, 1))
     level = (C @ bias[..., None])[..., 0] / GRAVITY
     # What is felt as up is turned into up: about east by north, about north by minus east.
@@ -80,7 +81,7 @@ def test_bias_tilts_by_its_ratio_to_gravity() -> None:
 def test_gyro_compass_is_exact_and_turned_by_a_drift() -> None:
     C = attitudes()
     force, rate = still(C, LATITUDES)
-    compass = jax.jit(jax.vmap(gyro_compass))
+    compass = compiled(jax.vmap(gyro_compass))
     np.testing.assert_allclose(compass(force, rate), C, rtol=0, atol=2e-14)
     drift = 1e-3 * DEG_PER_HOUR
     east = C.transpose(0, 2, 1) @ [drift, 0.0, 0.0]
@@ -98,10 +99,10 @@ def test_course_is_a_heading_for_those_who_move() -> None:
     speed = np.array(
         [[0.0, 5, 1], [5, 0, 0], [-3, -3, 9], [0.3, 0.4, 30], [0, 0, 0], [0.6, 0.8, 0]]
     )
-    heading, usable = jax.jit(jax.vmap(course_heading))(speed)
+    heading, usable = compiled(jax.vmap(course_heading))(speed)
     np.testing.assert_allclose(np.asarray(heading)[:3] / DEG, [0, 90, -135], rtol=1e-15)
     np.testing.assert_array_equal(usable, [True, True, True, False, False, True])
-    slope = jax.jit(jax.vmap(jax.grad(lambda v: course_heading(v)[0])))(speed)
+    slope = compiled(jax.vmap(jax.grad(lambda v: course_heading(v)[0])))(speed)
     assert np.all(np.isfinite(slope))
 
 
@@ -109,7 +110,7 @@ def test_static_biases_are_what_rest_does_not_explain() -> None:
     C = attitudes()
     force, rate = still(C, LATITUDES)
     drift, bias = np.random.default_rng(3).normal(size=(2, 40, 3)) * [[[1e-5]], [[1e-2]]]
-    found = jax.jit(jax.vmap(static_biases, (0, 0, 0, 0, None)))(
+    found = compiled(jax.vmap(static_biases, (0, 0, 0, 0, None)))(
         C, force + bias, rate + drift, LATITUDES, GRAVITY
     )
     np.testing.assert_allclose(found[0], drift, rtol=0, atol=1e-19)
@@ -123,7 +124,7 @@ def test_fixes_have_the_noise_they_are_said_to_have() -> None:
     position = np.tile([60 * DEG, np.pi, 500.0], (count, 1))
     sigmas = jnp.array([0.1, 0.2, 0.3]), jnp.array([3.0, 4.0, 8.0])
 
-    @jax.jit
+    @compiled
     def whitened(key: Array, share: Array) -> Array:
         errors = GnssErrors(*sigmas, share, scale)
         z = observe_gnss(key, jnp.array(velocity), jnp.array(position), errors)
@@ -168,7 +169,7 @@ def test_antenna_moves_as_the_model_observes() -> None:
             seen = model.observe(params, SinsLevel(C, v, p, none, none), u)
             return seen, jnp.concatenate(antenna_motion(C, v, p, w, arm, earth))
 
-        seen, moved = jax.jit(jax.vmap(both))(C, velocity, position, rate, of_earth, arm)
+        seen, moved = compiled(jax.vmap(both))(C, velocity, position, rate, of_earth, arm)
         np.testing.assert_allclose(moved, seen, rtol=1e-14, atol=1e-12)
         swung = np.asarray(seen)[:, :3] - velocity - (C @ np.cross(rate, arm)[..., None])[..., 0]
         np.testing.assert_allclose(swung, 0, rtol=0, atol=1e-12)

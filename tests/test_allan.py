@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.sensors import allan, imu, noise_fit
 from jaxnav.navigation.sensors.allan import (
     chi_square_ends,
@@ -20,14 +21,14 @@ from jaxnav.navigation.sensors.noise_fit import (
 )
 
 # As programs: a kernel for every operation and shape takes longer to compile.
-allan_variance = jax.jit(allan.allan_variance, static_argnames=("step", "sizes", "overlapping"))
-slope_rule = jax.jit(allan.slope_rule, static_argnames="sharpness")
-degrees_of_freedom = jax.jit(
+allan_variance = compiled(allan.allan_variance, static_argnames=("step", "sizes", "overlapping"))
+slope_rule = compiled(allan.slope_rule, static_argnames="sharpness")
+degrees_of_freedom = compiled(
     noise_fit.degrees_of_freedom, static_argnames=("step", "sizes", "count")
 )
-fit_noise = jax.jit(noise_fit.fit_noise, static_argnames=("step", "sizes", "count"))
-model_variance = jax.jit(noise_fit.model_variance)
-sensor_noise = jax.jit(imu.sensor_noise, static_argnames=("step", "count"))
+fit_noise = compiled(noise_fit.fit_noise, static_argnames=("step", "sizes", "count"))
+model_variance = compiled(noise_fit.model_variance)
+sensor_noise = compiled(imu.sensor_noise, static_argnames=("step", "count"))
 
 STEP, COUNT = 0.01, 2**14
 SIZES = cluster_sizes(COUNT)
@@ -95,7 +96,7 @@ def test_lost_samples_are_never_used(key):
     rate, lost = jax.random.normal(key, (500,)), np.zeros(500, bool)
     lost[[0, 17, 18, 400]] = True
     valid = jnp.asarray(~lost)
-    measure = jax.jit(lambda rate: allan_variance(rate, 1.0, (1, 3, 20), valid))
+    measure = compiled(lambda rate: allan_variance(rate, 1.0, (1, 3, 20), valid))
     clean = measure(rate)
     for value in (jnp.nan, jnp.inf, 1e300, 0.0):
         spoilt = measure(jnp.where(lost, value, rate))
@@ -119,7 +120,7 @@ def test_gaps_leave_the_expectation(key):
     count, runs, sizes = 3000, 400, (1, 4, 16, 64)
     valid = jnp.ones(count, bool).at[700:1700].set(False)
     rates = jax.random.normal(key, (runs, count))
-    measured = jax.jit(jax.vmap(lambda rate: allan_variance(rate, 1.0, sizes, valid)))(rates)
+    measured = compiled(jax.vmap(lambda rate: allan_variance(rate, 1.0, sizes, valid)))(rates)
     freedom = degrees_of_freedom(noise_model(N=1.0), 1.0, sizes, count, measured.share[0])
     ratio = np.asarray(measured.variance) * sizes
     error = np.sqrt(2 / np.asarray(freedom) / runs)
@@ -227,7 +228,7 @@ def test_injected_noise_is_inside_the_intervals(key):
         fit = fit_noise(measured, step, sizes, count)
         return measured, fit, degrees_of_freedom(fit.noise, step, sizes, count)
 
-    run = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=10))
+    run = compiled(lambda keys: jax.lax.map(one, keys, batch_size=10))
     measured, fit, freedom = run(jax.random.split(key, runs))
     low, high = coefficient_interval(fit)
     for name in ("random_walk", "bias_instability", "rate_random_walk"):
@@ -255,7 +256,7 @@ def test_random_walk_of_a_minute_at_rest(key):
         rules = slope_rule(measured), slope_rule(measured, 3000.0)
         return jnp.stack([fit_noise(measured, step, sizes, count).noise.random_walk, *rules])
 
-    found = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=10))(jax.random.split(key, 100))
+    found = compiled(lambda keys: jax.lax.map(one, keys, batch_size=10))(jax.random.split(key, 100))
     error = np.asarray(found) / truth - 1
     assert np.abs(error[:, 0]).max() < 0.03
     fitted, hard, smooth = np.sqrt(np.mean(error**2, axis=0))
@@ -328,7 +329,7 @@ def test_gradients_are_those_of_central_differences(key):
     parts = (noise_model(N=1.0), noise_model(B=1.0), noise_model(K=0.2))
     noises = jnp.stack([sensor_noise(k, n, step, count) for k, n in zip(keys, parts, strict=True)])
 
-    @jax.jit
+    @compiled
     def found(amplitude):
         measured = allan_variance(amplitude @ noises, step, sizes)
         fit = fit_noise(measured, step, sizes, count)
@@ -338,7 +339,7 @@ def test_gradients_are_those_of_central_differences(key):
     assert np.all(found(at) > 0)
     small = 1e-5 * jnp.eye(3)
     central = [(found(at + e) - found(at - e)) / 2e-5 for e in small]
-    slope = jax.jit(jax.jacrev(found))
+    slope = compiled(jax.jacrev(found))
     np.testing.assert_allclose(slope(at), np.stack(central, axis=1), rtol=1e-6, atol=1e-7)
     np.testing.assert_array_equal(slope(jnp.zeros(3)), 0)
 
@@ -353,11 +354,11 @@ def test_compiled_equals_eager_in_either_precision(key):
         return measured, fit, allan.slope_rule(measured, 100.0)
 
     rate = jax.random.normal(key, (count,))
-    eager, compiled = found(rate), jax.jit(found)(rate)
-    for one, other in zip(jax.tree.leaves(eager), jax.tree.leaves(compiled), strict=True):
+    eager, program = found(rate), compiled(found)(rate)
+    for one, other in zip(jax.tree.leaves(eager), jax.tree.leaves(program), strict=True):
         scale = np.max(np.abs(one)) + 1e-300
         np.testing.assert_allclose(one / scale, other / scale, rtol=0, atol=1e-9)
-    coarse = jax.jit(found)(rate.astype(jnp.float32))
+    coarse = compiled(found)(rate.astype(jnp.float32))
     assert {leaf.dtype for leaf in jax.tree.leaves(coarse)} == {jnp.dtype("float32")}
     np.testing.assert_allclose(coarse[1].noise.random_walk, eager[1].noise.random_walk, rtol=1e-4)
 
@@ -371,7 +372,7 @@ def test_noises_follow_their_laws(key):
     sizes = (8, 32, 128)
     tau = step * jnp.asarray(sizes, float)
 
-    @jax.jit
+    @compiled
     def measure(axes):
         keys = jax.random.split(key, runs)
         rates = jax.vmap(lambda k: sensor_noise(k, axes, step, count))(keys)

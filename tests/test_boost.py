@@ -7,6 +7,7 @@ import numpy as np
 from oracles import rotations, sins
 from oracles.matrices import central_difference
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.strapdown.launch_inertial import mechanise_launch_inertial
 from jaxnav.navigation.trajectory.boost import BoostProfile, fly_boost, pitch
 from jaxnav.units import ARCSEC, DEG
@@ -43,7 +44,7 @@ def quadratic(t):
 def test_perfect_increments_reproduce_the_flight():
     truth = flight()
     start = jax.tree.map(lambda leaf: leaf[0], truth.state)
-    mechanise = jax.jit(mechanise_launch_inertial, static_argnames=("step", "every"))
+    mechanise = compiled(mechanise_launch_inertial, static_argnames=("step", "every"))
     solution = mechanise(start, truth.dtheta, truth.dvel, STEP, RADIUS, every=5)
     C, v, r = jax.tree.map(lambda leaf: leaf[5::5], truth.state)
     position = np.linalg.norm(solution.state.position - r, axis=1)
@@ -149,11 +150,11 @@ def test_flight_differentiates_by_its_profile():
     # One relative direction through all ten numbers, both ways.
     direction = values * np.linspace(0.5, -1.0, len(values))
 
-    fly = jax.jit(last)
-    slopes = jax.jit(lambda a: jax.jvp(last, (a,), (direction,))[1])(values)
+    fly = compiled(last)
+    slopes = compiled(lambda a: jax.jvp(last, (a,), (direction,))[1])(values)
     for k, of in enumerate(slopes):
         numeric = central_difference(lambda a, k=k: np.asarray(fly(a)[k]), values, direction, 1e-4)
         np.testing.assert_allclose(of, numeric, rtol=1e-7, atol=1e-9)
-    gradient = jax.jit(jax.grad(lambda a: last(a)[1][1]))(values)
+    gradient = compiled(jax.grad(lambda a: last(a)[1][1]))(values)
     assert np.all(np.isfinite(gradient))
     np.testing.assert_allclose(gradient @ direction, slopes[1][1], rtol=1e-11)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.adaptive import innovation_adaptive
 from jaxnav.estimation.filters.iterated import (
     iterated_ckf,
@@ -114,7 +115,7 @@ def batch_run(name: str, params: Any, z: Array) -> Trace:
             _TRACED[name] += 1
             return run(CASES[name].filter, params, PROBLEM.inputs, Obs(z, PROBLEM.valid))
 
-        _COMPILED[name] = jax.jit(jax.vmap(one, in_axes=(None, 0)))
+        _COMPILED[name] = compiled(jax.vmap(one, in_axes=(None, 0)))
     return _COMPILED[name](params, z)
 
 
@@ -273,8 +274,8 @@ def test_dtype_in_is_dtype_out(name: str) -> None:
         assert leaf.dtype in (jnp.float32, jnp.int32, jnp.bool_), leaf
     if name in ("kf", "square_root_kf"):
         # op by op is slow; the banks are these kernels under vmap
-        compiled = jax.jit(step)(narrow)
-        for a, b in zip(jax.tree.leaves(step(narrow)), jax.tree.leaves(compiled), strict=True):
+        program = compiled(step)(narrow)
+        for a, b in zip(jax.tree.leaves(step(narrow)), jax.tree.leaves(program), strict=True):
             np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5)
 
 
@@ -309,7 +310,7 @@ def test_segments_change_neither_value_nor_gradient() -> None:
             case.filter, params, PROBLEM.inputs, observations, segment=segment
         )
 
-    graded = jax.jit(jax.value_and_grad(loss), static_argnums=1)
+    graded = compiled(jax.value_and_grad(loss), static_argnums=1)
     for segment in (5, 4):
         np.testing.assert_allclose(
             graded(jnp.array(1.3), segment), graded(jnp.array(1.3), 0), rtol=1e-12

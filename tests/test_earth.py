@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from oracles import sins
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation import earth
 from jaxnav.units import DEG
 
@@ -24,9 +25,9 @@ PLACES = np.array(
     ]
 ) * [DEG, DEG, 1.0]
 
-ecef = jax.jit(jax.vmap(earth.ecef_from_geodetic))
-enu = jax.jit(jax.vmap(earth.enu_from_geodetic))
-gravity = jax.jit(jax.vmap(earth.gravity_launch_inertial, (0, None)))
+ecef = compiled(jax.vmap(earth.ecef_from_geodetic))
+enu = compiled(jax.vmap(earth.enu_from_geodetic))
+gravity = compiled(jax.vmap(earth.gravity_launch_inertial, (0, None)))
 
 
 def positions():
@@ -47,7 +48,7 @@ def test_height_is_along_the_normal_of_the_ellipsoid():
     normal = foot / np.array([A, A, B]) ** 2
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     np.testing.assert_allclose(p - foot, PLACES[:, 2:] * normal, rtol=0, atol=3e-9)
-    C = np.asarray(jax.jit(jax.vmap(earth.dcm_ne))(*PLACES[:, :2].T))
+    C = np.asarray(compiled(jax.vmap(earth.dcm_ne))(*PLACES[:, :2].T))
     np.testing.assert_allclose(C[:, 2], normal, rtol=0, atol=1e-15)
     np.testing.assert_allclose(
         C @ C.transpose(0, 2, 1), np.eye(3)[None] + 0 * C, rtol=0, atol=1e-15
@@ -61,7 +62,7 @@ def test_meridian_radius_at_the_equator_and_the_pole():
 
 
 def test_small_offsets_are_east_north_up():
-    @jax.jit
+    @compiled
     @jax.vmap
     def derivative(origin):
         return jax.jacfwd(earth.enu_from_geodetic)(origin, origin)
@@ -92,7 +93,7 @@ def test_gravitation_points_to_the_centre_with_the_inverse_square():
 
 
 def test_gravity_gradient_is_the_derivative_and_has_no_trace():
-    @jax.jit
+    @compiled
     @jax.vmap
     def gradients(r):
         automatic = jax.jacfwd(earth.gravity_launch_inertial)(r, RADIUS)
@@ -108,7 +109,7 @@ def test_gravity_gradient_is_the_derivative_and_has_no_trace():
 
 
 def test_normal_gravity_of_the_ellipsoid_and_above_it():
-    g = jax.jit(jax.vmap(earth.normal_gravity))
+    g = compiled(jax.vmap(earth.normal_gravity))
     at_sea = g(np.array([0.0, 0.5, -0.5]) * np.pi, np.zeros(3))
     np.testing.assert_allclose(at_sea, [9.7803253359, 9.8321849378, 9.8321849378], rtol=1e-11)
     latitude = np.array([0.0, 45.0, 90.0]) * DEG
@@ -124,7 +125,7 @@ def test_normal_gravity_of_the_ellipsoid_and_above_it():
 def test_frame_rates_are_those_of_its_turning_axes():
     places, velocity = PLACES[[0, 1, 5, 6]], np.array([250.0, -120.0, 30.0])
 
-    @jax.jit
+    @compiled
     @jax.vmap
     def rates(p):
         metres = earth.metres_per_radian(p)
@@ -153,15 +154,15 @@ def test_offsets_and_displacements_undo_each_other_across_the_antimeridian():
     places = PLACES[[0, 1, 2, 5, 6]]
     offset = np.random.default_rng(2).uniform(-5e3, 5e3, (5, 3))
     offset[3:, 0] = [4e3, -4e3]
-    moved = jax.jit(jax.vmap(earth.displaced))(places, offset)
-    back = jax.jit(jax.vmap(earth.offset_between))
+    moved = compiled(jax.vmap(earth.displaced))(places, offset)
+    back = compiled(jax.vmap(earth.offset_between))
     np.testing.assert_allclose(back(places, moved), offset, rtol=0, atol=3e-9)
     wrapped = np.array(moved)
     wrapped[3:, 1] -= np.sign(wrapped[3:, 1]) * 2 * np.pi
     assert np.all(np.abs(wrapped[3:, 1]) < np.pi)
     np.testing.assert_allclose(back(places, wrapped), offset, rtol=0, atol=6e-9)
     # Exact but for the curvature: d^2 / (2 R), with the tangent of the latitude across.
-    near = jax.jit(jax.vmap(earth.displaced))(places, 0.1 * offset)
+    near = compiled(jax.vmap(earth.displaced))(places, 0.1 * offset)
     np.testing.assert_allclose(enu(near, places), 0.1 * offset, rtol=0, atol=0.1)
 
 

@@ -2,7 +2,6 @@
 
 import ast
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +15,7 @@ from jax import Array
 from jax.test_util import check_jvp, check_vjp
 
 import jaxnav
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.imm import uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams
 from jaxnav.estimation.banks.weights import Penalty, WindowedReset
@@ -37,12 +37,7 @@ from jaxnav.numerics.sigma import SigmaRule, unscented
 from tests.cases import Noise, cases
 from tests.oracles.matrices import central_difference
 
-QUICK = {
-    "xla_backend_optimization_level": 0,
-    "xla_llvm_disable_expensive_passes": True,
-    "xla_cpu_use_fusion_emitters": False,
-}
-"""Most of the time is that of the compiler, and the speed of what it makes does not matter."""
+pytestmark = pytest.mark.usefixtures("quick_programs")
 
 
 def oscillator(observe: Callable[[Array], Array]) -> Model:
@@ -144,7 +139,7 @@ def test_gradient_over_ten_steps(name: str) -> None:
     """Backward and forward, by the noise and by every parameter of the case's own."""
     loss, point = log_factors(name, 10), start(name)
 
-    @partial(jax.jit, compiler_options=QUICK)
+    @compiled
     def both(theta: Array, ahead: Array) -> tuple[tuple[Array, Array], Array]:
         return jax.jvp(loss, (theta,), (ahead,)), jax.grad(loss)(theta)
 
@@ -180,7 +175,7 @@ def test_gradient_over_ten_thousand_steps(name: str) -> None:
     """Those by the noise neither vanish nor explode. All points run side by side."""
     point, h = start(name), 1e-6 if name in HARD else 1e-4
     loss = log_factors(name, 10_000, segment=100)
-    both = jax.jit(jax.vmap(jax.value_and_grad(loss)), compiler_options=QUICK)
+    both = compiled(jax.vmap(jax.value_and_grad(loss)))
     moves = h * np.array([1, -1])[:, None, None] * np.eye(point.size)
     values, gradients = both(np.concatenate([point[None], *(point + moves)]))
     above, below = np.reshape(values[1:], (2, point.size))
@@ -230,7 +225,7 @@ SINGULAR: dict[str, tuple[Callable[[Array], Array], Array]] = {
 def test_value_and_gradient_are_finite_at_a_singular_point(name: str) -> None:
     """Of roots, norms, angles and factors, where the plain functions give infinity or NaN."""
     function, point = SINGULAR[name]
-    value, gradient = jax.jit(jax.value_and_grad(function), compiler_options=QUICK)(point)
+    value, gradient = compiled(jax.value_and_grad(function))(point)
     assert np.isfinite(value)
     assert np.all(np.isfinite(gradient))
 
@@ -264,7 +259,7 @@ def test_arrays_given_to_qr_are_tall_and_of_full_rank(
         monkeypatch.setattr(module, "tria", recorded)
     filter, params, _ = cases(oscillator(lambda x: x), PARAMS, 1)[name]
 
-    @partial(jax.jit, compiler_options=QUICK)
+    @compiled
     def step(z: Array) -> Any:
         state = filter.predict(params, filter.init(params), jnp.array(0.5))
         return filter.update(params, state, jnp.array(0.5), Obs(z, jnp.ones(1, bool)))
@@ -362,7 +357,7 @@ def test_derivative_of_the_steady_covariance_is_that_of_riccati() -> None:
         last = run(kf(WALK), params, jnp.zeros(steps), silent, record=lambda s, i: (), segment=100)
         return last.final.P[0, 0]
 
-    graded = jax.jit(jax.vmap(jax.value_and_grad(steady, (0, 1))), compiler_options=QUICK)
+    graded = compiled(jax.vmap(jax.value_and_grad(steady, (0, 1))))
     P, (by_q, by_r) = graded(q, r)
     root = np.sqrt(q**2 + 4 * q * r)
     np.testing.assert_allclose(P, 2 * q * r / (root + q), rtol=1e-12)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, mmae
 from jaxnav.estimation.filters.iterated import (
     iterated_ckf,
@@ -90,7 +91,7 @@ def one_update(name: str, params: FilterParams, z: Array) -> tuple[Gaussian, Inf
     return filter.estimate(state), info
 
 
-one_update_jit = jax.jit(one_update, static_argnums=0)
+one_update_jit = compiled(one_update, static_argnums=0)
 
 
 def nearly_parallel(delta: float, dtype: jnp.dtype) -> FilterParams:
@@ -207,7 +208,7 @@ def test_no_wrong_covariance_goes_without_a_flag(name: str, dtype: jnp.dtype) ->
     deltas = [float(np.asarray(10.0**-e, dtype)) for e in exponents]
     cases = [nearly_parallel(delta, dtype) for delta in deltas]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
-    one = jax.jit(jax.vmap(lambda params: one_update(name, params, jnp.zeros(2, dtype))))
+    one = compiled(jax.vmap(lambda params: one_update(name, params, jnp.zeros(2, dtype))))
     estimate, info = one(stacked)
     errors = []
     for params, delta, cov in zip(cases, deltas, np.asarray(estimate.cov, float), strict=True):
@@ -239,7 +240,7 @@ def test_gradient_of_the_ill_conditioned_update(name: str) -> None:
     S = [3 + r, 2 + h, 2 + h * h + r]
     a, b = (Decimal(float(value)) for value in z)
     nis = (S[2] * a * a - 2 * S[1] * a * b + S[0] * b * b) / (S[0] * S[2] - S[1] ** 2)
-    gradient = jax.jit(jax.grad(loss))(jnp.array(1.0))
+    gradient = compiled(jax.grad(loss))(jnp.array(1.0))
     np.testing.assert_allclose(gradient, float(1 - nis / 2), rtol=1e-6)
 
 
@@ -267,7 +268,7 @@ def test_perfect_knowledge_and_perfect_sensors(name: str) -> None:
             estimate, info = one_update(name, params._replace(model=model), jnp.ones(1))
             return jnp.sum(estimate.mean) + jnp.maximum(info.log_likelihood, -1.0)
 
-        assert np.all(np.isfinite(jax.jit(jax.grad(moved))(jnp.zeros(1))))
+        assert np.all(np.isfinite(compiled(jax.grad(moved))(jnp.zeros(1))))
 
 
 @each_run

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.imm import imm, imm_params, mix, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, mmae, moment_match
 from jaxnav.estimation.banks.weights import normalise, switched
@@ -179,7 +180,7 @@ def test_mixing_keeps_the_moments_of_the_bank() -> None:
 def test_gradient_by_the_switching_probability() -> None:
     obs = Obs(jnp.array(DATA), jnp.ones(DATA.shape, bool))
 
-    @jax.jit
+    @compiled
     def loss(p: Array) -> Array:
         params = THREE(uniform_switching(3, p))
         return negative_log_likelihood(IMM, params, jnp.ones(STEPS), obs)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, mmae
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.metrics import chi2_mean_bounds, nees, rmse
@@ -143,7 +144,7 @@ def test_open_loop_solution_drifts_by_the_drift() -> None:
     world = build_world(config)
     keys = jax.random.split(jax.random.key(2), 20)
     for fly in (fly_sins, fly_linear):
-        flights = jax.jit(jax.vmap(lambda key, fly=fly: fly(key, world, 0.05, 0.01)))(keys)
+        flights = compiled(jax.vmap(lambda key, fly=fly: fly(key, world, 0.05, 0.01)))(keys)
         phi = np.asarray(flights.error[:, -1, :3]).mean(axis=0) / ARCSEC
         # 0.5 "/s on each axis turned by the attitude over a minute, scatter 1"/s over 100 Hz
         growth = np.linalg.norm(phi - np.array([10.0, 6.0, 10.0]))
@@ -189,7 +190,7 @@ def test_matched_filter_is_consistent_and_a_mistuned_one_is_not() -> None:
     initial = Gaussian(jnp.zeros(15), jnp.diag(prior_sigma(config) ** 2))
     filter = kf(sins_cns(0.05, 0.01))
 
-    @jax.jit
+    @compiled
     def nees_of(keys: jax.Array, scale: jax.Array) -> jax.Array:
         params = FilterParams(noise_of(config)._replace(noise_scale=scale), initial)
 

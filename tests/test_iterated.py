@@ -11,6 +11,7 @@ import pytest
 from jax import Array
 from scipy.optimize import least_squares
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, mmae
 from jaxnav.estimation.filters.iterated import (
     iterated_ckf,
@@ -70,17 +71,17 @@ def batch(prior: Gaussian, noise: Any = 1.0, **entries: Any) -> FilterParams:
 
 
 @cache
-def compiled(filter: Filter) -> Callable[[FilterParams, Obs], tuple[Gaussian, Info]]:
+def program(filter: Filter) -> Callable[[FilterParams, Obs], tuple[Gaussian, Info]]:
     def one(params: FilterParams, obs: Obs) -> tuple[Gaussian, Info]:
         state, info = filter.update(params, filter.init(params), jnp.zeros(()), obs)
         return filter.estimate(state), info
 
-    return jax.jit(jax.vmap(one))
+    return compiled(jax.vmap(one))
 
 
 def updated(filter: Filter, params: FilterParams, obs: Obs) -> tuple[Gaussian, Info]:
     """Update a batch of priors, each with one observation."""
-    return compiled(filter)(params, obs)
+    return program(filter)(params, obs)
 
 
 def whole(z: Any) -> Obs:
@@ -697,10 +698,10 @@ def test_gradients_are_exact_and_finite(name: str) -> None:
         state, info = filter.update(params, filter.init(params), jnp.zeros(()), obs)
         return jnp.append(filter.estimate(state).mean, info.log_likelihood)
 
-    value, backward = (jax.jit(jax.vmap(f)) for f in (outcome, jax.jacrev(outcome)))
+    value, backward = (compiled(jax.vmap(f)) for f in (outcome, jax.jacrev(outcome)))
     exact = np.asarray(backward(at, obs, jnp.array(cov)))
     if name == "ckf":
-        forward = jax.jit(jax.vmap(jax.jacfwd(outcome)))(at, obs, jnp.array(cov))
+        forward = compiled(jax.vmap(jax.jacfwd(outcome)))(at, obs, jnp.array(cov))
         np.testing.assert_allclose(forward, exact, rtol=1e-10, atol=1e-12)
     h, columns = 2e-4, []
     for i in range(6):
@@ -739,7 +740,7 @@ def test_members_of_a_bank_may_differ_in_their_search() -> None:
     one = jax.tree.map(lambda leaf: leaf[1], obs)
     bank = mmae(SHORT["ckf"])
 
-    @jax.jit
+    @compiled
     def update(params: FilterParams) -> tuple[Array, Gaussian]:
         given = BankParams(params, ())
         state, _ = bank.update(given, bank.init(given), jnp.zeros(()), one)
@@ -820,7 +821,7 @@ def test_gradient_beside_a_trial_that_overflows() -> None:
         state, _ = steep.update(params, steep.init(params), jnp.zeros(()), whole([20.0]))
         return steep.estimate(state).mean[0]
 
-    value, gradient = jax.jit(jax.value_and_grad(found))(jnp.array([-5.0]))
+    value, gradient = compiled(jax.value_and_grad(found))(jnp.array([-5.0]))
     np.testing.assert_allclose(value, np.log(20), atol=1e-2)
     assert np.all(np.isfinite(gradient))
 
@@ -834,7 +835,7 @@ def test_gradient_by_the_noise_of_a_perfect_channel() -> None:
         _, info = filter.update(params, filter.init(params), jnp.zeros(()), whole([1.0, 2.0]))
         return info.log_likelihood
 
-    assert np.all(np.isfinite(jax.jit(jax.grad(found))(jnp.array([0.0, 4.0]))))
+    assert np.all(np.isfinite(compiled(jax.grad(found))(jnp.array([0.0, 4.0]))))
 
 
 def test_bad_arguments_are_named() -> None:

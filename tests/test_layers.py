@@ -237,12 +237,16 @@ def test_jit_appears_where_time_or_runs_are_driven() -> None:
         "estimation.montecarlo",
         "estimation.tune",
         "navigation.trajectory",
+        "navigation.atmosphere",
+        "navigation.limb",
     )
     for name, path in modules().items():
         if name.startswith(("numerics", "estimation", "navigation")) and not name.startswith(
             drivers
         ):
-            assert "jax.jit" not in path.read_text(), name
+            text = path.read_text()
+            assert "jax.jit" not in text, name
+            assert "import compiled" not in text, name
 
 
 def test_the_library_leaves_the_configuration_of_jax_alone() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from oracles import rotations
 from oracles.matrices import central_difference
 
+from jaxnav.compiling import compiled
 from jaxnav.numerics import lie
 
 SWITCH = 1e-2
@@ -36,13 +37,13 @@ def assert_rotations(C):
     np.testing.assert_allclose(np.linalg.det(C), 1, rtol=0, atol=2e-15)
 
 
-exp = jax.jit(jax.vmap(lie.so3_exp))
-log = jax.jit(jax.vmap(lie.so3_log))
+exp = compiled(jax.vmap(lie.so3_exp))
+log = compiled(jax.vmap(lie.so3_log))
 
 
 def test_skew_is_the_cross_product():
     v, w = np.random.default_rng(2).standard_normal((2, 20, 3))
-    K = np.asarray(jax.jit(jax.vmap(lie.skew))(v))
+    K = np.asarray(compiled(jax.vmap(lie.skew))(v))
     np.testing.assert_allclose((K @ w[..., None])[..., 0], np.cross(v, w), rtol=0, atol=1e-15)
     np.testing.assert_array_equal(K, -inverse(K))
 
@@ -85,7 +86,7 @@ def test_log_up_to_and_at_pi():
 def test_left_jacobian_equals_its_series_and_its_definition():
     phi = vectors(ANGLES)
 
-    @jax.jit
+    @compiled
     @jax.vmap
     def jacobians(phi):
         def turned(d):
@@ -106,7 +107,7 @@ def test_left_jacobian_equals_its_series_and_its_definition():
 def test_derivatives_are_right_from_zero_to_near_pi():
     phi = vectors(ANGLES, per_angle=4)
 
-    @jax.jit
+    @compiled
     @jax.vmap
     def derivatives(phi):
         def there_and_back(p):
@@ -136,7 +137,7 @@ def test_second_derivatives_at_zero():
         p = t * direction
         return lie.so3_log(lie.so3_exp(p)), lie.so3_left_jacobian(p)
 
-    of_log, of_jacobian = jax.jit(jax.jacfwd(jax.jacfwd(along)))(0.0)
+    of_log, of_jacobian = compiled(jax.jacfwd(jax.jacfwd(along)))(0.0)
     np.testing.assert_allclose(of_log, 0, rtol=0, atol=1e-15)
     K = rotations.skew(np.asarray(direction))
     np.testing.assert_allclose(of_jacobian, K @ K / 3, rtol=1e-15)
@@ -153,10 +154,10 @@ def random_angles(count):
 
 def test_euler_angles_round_trip():
     angles = random_angles(200)
-    C = np.asarray(jax.jit(jax.vmap(lie.dcm_from_euler))(*angles.T))
+    C = np.asarray(compiled(jax.vmap(lie.dcm_from_euler))(*angles.T))
     np.testing.assert_allclose(C, [rotations.dcm(*a) for a in angles], rtol=0, atol=1e-14)
     assert_rotations(C)
-    back = np.asarray(jax.jit(jax.vmap(lie.euler_from_dcm))(C))
+    back = np.asarray(compiled(jax.vmap(lie.euler_from_dcm))(C))
     wrapped = (back - angles + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(wrapped, 0, rtol=0, atol=2e-15)
     np.testing.assert_array_less(np.abs(back), np.pi + 1e-15)
@@ -165,14 +166,14 @@ def test_euler_angles_round_trip():
 def test_yaw_keeps_its_precision_close_to_its_limit():
     for yaw in (np.pi / 2 - 1e-6, 1e-6 - np.pi / 2):
         C = rotations.dcm(0.3, yaw, 0.4)
-        np.testing.assert_allclose(jax.jit(lie.euler_from_dcm)(C)[1], yaw, rtol=1e-15)
+        np.testing.assert_allclose(compiled(lie.euler_from_dcm)(C)[1], yaw, rtol=1e-15)
 
 
 def test_euler_errors_of_a_small_rotation():
     angles = random_angles(60)
     C = np.array([rotations.dcm(*a) for a in angles])
 
-    @jax.jit
+    @compiled
     @jax.vmap
     def maps(C):
         def turned(phi):
@@ -208,8 +209,8 @@ def closed_rate_map(pitch, yaw, roll):
 def test_euler_maps_are_those_of_the_paper_as_meant():
     angles = random_angles(200)
     C = np.array([rotations.dcm(*a) for a in angles])
-    M = np.asarray(jax.jit(jax.vmap(lie.euler_error_from_rotation))(C))
-    W = np.asarray(jax.jit(jax.vmap(lie.body_rate_from_euler_rate))(*angles.T))
+    M = np.asarray(compiled(jax.vmap(lie.euler_error_from_rotation))(C))
+    W = np.asarray(compiled(jax.vmap(lie.body_rate_from_euler_rate))(*angles.T))
     inverse_of_m = np.array([closed_error_map(*a) for a in angles])
     one = np.broadcast_to(np.eye(3), M.shape)
     np.testing.assert_allclose(M @ inverse_of_m, one, rtol=0, atol=2e-15)
@@ -220,7 +221,7 @@ def test_euler_maps_are_those_of_the_paper_as_meant():
 
 def test_body_rates_are_those_of_the_turning_matrix():
     angles = random_angles(60)
-    W = np.asarray(jax.jit(jax.vmap(lie.body_rate_from_euler_rate))(*angles.T))
+    W = np.asarray(compiled(jax.vmap(lie.body_rate_from_euler_rate))(*angles.T))
     for a, w in zip(angles, W, strict=True):
         C = rotations.dcm(*a)
         for k, axis in enumerate(np.eye(3)):
@@ -233,7 +234,7 @@ def test_body_rate_map_is_singular_at_a_quarter_turn_of_yaw_alone():
     rng = np.random.default_rng(4)
     pitch, roll = rng.uniform(-np.pi, np.pi, (2, 41))
     pitch[:2], yaw = np.pi / 2, np.linspace(-np.pi / 2, np.pi / 2, 41)
-    W = np.asarray(jax.jit(jax.vmap(lie.body_rate_from_euler_rate))(pitch, yaw, roll))
+    W = np.asarray(compiled(jax.vmap(lie.body_rate_from_euler_rate))(pitch, yaw, roll))
     np.testing.assert_allclose(np.linalg.det(W), -np.cos(yaw), rtol=0, atol=1e-15)
 
 
@@ -245,7 +246,7 @@ def test_log_takes_every_branch_with_finite_derivatives():
     near = np.array([rotations.exp((np.pi - 1e-7) * a) for a in axes])
     third = np.array([rotations.exp(2 * np.pi / 3 * axes[-1])])
     C = np.concatenate([np.eye(3)[None], half, near, third])
-    back, forward, reverse = jax.jit(
+    back, forward, reverse = compiled(
         jax.vmap(lambda C: (lie.so3_log(C), jax.jacfwd(lie.so3_log)(C), jax.jacrev(lie.so3_log)(C)))
     )(C)
     np.testing.assert_allclose([rotations.exp(p) for p in np.asarray(back)], C, rtol=0, atol=2e-15)
@@ -256,7 +257,7 @@ def test_log_takes_every_branch_with_finite_derivatives():
 
 def test_float32_stays_float32_and_precise():
     phi = vectors([1e-6, 1e-3, 0.1, 0.2 - 1e-6, 0.2 + 1e-6, 1.0, 3.0]).astype(np.float32)
-    C, J, back = exp(phi), jax.jit(jax.vmap(lie.so3_left_jacobian))(phi), log(exp(phi))
+    C, J, back = exp(phi), compiled(jax.vmap(lie.so3_left_jacobian))(phi), log(exp(phi))
     assert C.dtype == J.dtype == back.dtype == jnp.float32
     exact = phi.astype(float)
     np.testing.assert_allclose(C, [rotations.exp(p) for p in exact], rtol=0, atol=3e-7)

@@ -10,6 +10,7 @@ from jax import Array
 from oracles.matrices import central_difference
 from scipy.integrate import solve_ivp
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.atmosphere import (
     REFRACTIVITY,
     TOP,
@@ -33,7 +34,7 @@ from jaxnav.navigation.sensors.refraction import Camera, Sight, measure, pick, v
 from jaxnav.units import ARCSEC, DEG
 
 HEIGHTS = np.array([20.0, 25.0, 30.0, 35.0, 40.0]) * 1e3
-traced = jax.jit(jax.vmap(refraction_angle))
+traced = compiled(jax.vmap(refraction_angle))
 POSITION = jnp.array([1e5, MEAN_RADIUS + 4e5, -2e5])
 ALL_ROUND = Camera(jnp.array([0.0, 1.0, 0.0]), np.pi, 6.5)
 
@@ -63,13 +64,13 @@ def test_density_is_that_of_the_standard() -> None:
 def test_traced_angles_are_those_of_the_specification() -> None:
     angles = traced(jnp.array(HEIGHTS)) / ARCSEC
     np.testing.assert_allclose(angles, [332.68, 148.02, 67.23, 30.69, 14.06], rtol=5e-4)
-    finer = jax.jit(jax.vmap(lambda h: refraction_angle(h, nodes=48)))(jnp.array(HEIGHTS))
+    finer = compiled(jax.vmap(lambda h: refraction_angle(h, nodes=48)))(jnp.array(HEIGHTS))
     np.testing.assert_allclose(angles, finer / ARCSEC, rtol=1e-9)
 
 
 def test_a_ray_traced_as_a_curve_is_bent_as_much_and_seen_where_the_geometry_says() -> None:
     """d/ds (n dr/ds) = grad n from the tangent point to an observer; no Bouguer rule in it."""
-    slope = jax.jit(jax.value_and_grad(lambda h: 1 + REFRACTIVITY * density(h)))
+    slope = compiled(jax.value_and_grad(lambda h: 1 + REFRACTIVITY * density(h)))
 
     def derivative(s: float, state: np.ndarray) -> np.ndarray:
         r, t = state[:2], state[2:]

@@ -6,13 +6,14 @@ import numpy as np
 from jax.test_util import check_grads
 from oracles.matrices import central_difference, random_spd
 
+from jaxnav.compiling import compiled
 from jaxnav.numerics import linalg
 
 SIZES = range(1, 9)
 COUNT = 64
 
 
-@jax.jit
+@compiled
 def kernels(batches):
     def one(S, L, B):
         return {
@@ -65,7 +66,7 @@ def test_vectors_and_the_sizes_around_the_limit():
     pairs = [(rng.standard_normal((3, k)), rng.standard_normal((k, 2))) for k in inner]
     factors = [np.tril(rng.standard_normal((m, m))) + 3 * np.eye(m) for m in (1, 3, 7)]
 
-    @jax.jit
+    @compiled
     def calculated(pairs, factors):
         products = [(linalg.matmul(A, B), linalg.matmul(A, B[:, 0])) for A, B in pairs]
         solves = [
@@ -112,7 +113,7 @@ def indefinite(m):
 def test_factor_of_an_indefinite_matrix_is_reported_and_finite():
     batches = [indefinite(m) for m in (3, 7)]
 
-    @jax.jit
+    @compiled
     def factor_and_gradient(batches):
         def total(S):
             root = linalg.cholesky(S)
@@ -130,7 +131,7 @@ def test_factor_of_an_indefinite_matrix_is_reported_and_finite():
 
 def test_a_matrix_with_nan_is_reported_and_its_factor_finite():
     S = [jnp.eye(m).at[1, 0].set(jnp.nan).at[0, 1].set(jnp.nan) for m in (3, 7)]
-    for root in jax.jit(lambda S: [linalg.cholesky(s) for s in S])(S):
+    for root in compiled(lambda S: [linalg.cholesky(s) for s in S])(S):
         assert not root.positive_definite
         assert root.reciprocal_pivot == 0
         assert np.all(np.isfinite(root.factor))
@@ -143,7 +144,7 @@ def test_reciprocal_pivot_tells_how_many_digits_are_left():
     H[:, 1, 2] += d
     dyer_mcreynolds = H @ H.transpose(0, 2, 1) + (d * d)[:, None, None] * np.eye(2)
 
-    @jax.jit
+    @compiled
     def factor(diagonals, innovation_cov):
         return [linalg.cholesky(S) for S in diagonals], jax.vmap(linalg.cholesky)(innovation_cov)
 
@@ -162,7 +163,7 @@ def test_derivatives_of_cholesky_equal_finite_differences():
     E = [e + e.transpose(0, 2, 1) for e in (rng.standard_normal(s.shape) for s in S)]
     W = [rng.standard_normal(s.shape) for s in S]
 
-    @jax.jit
+    @compiled
     def both_modes(S, E, W):
         def one(s, e, w):
             def factor(x):
@@ -189,7 +190,7 @@ def test_root_of_a_singular_matrix():
     A[5, ::2, ::2] = block[2]
     A[6] = random_spd(rng, 1, 6)
 
-    @jax.jit
+    @compiled
     def root_and_gradient(A):
         def total(a):
             return jnp.sum(linalg.semidefinite_root(a).factor)
@@ -210,7 +211,7 @@ def test_root_of_a_matrix_that_is_singular_to_rounding():
     rng = np.random.default_rng(6)
     axes = np.linalg.qr(rng.standard_normal((50_000, 3, 3)))[0]
     A = (axes * np.array([1.0, 1.0, 0.0])) @ axes.transpose(0, 2, 1)
-    root = jax.jit(jax.vmap(linalg.semidefinite_root))(A)
+    root = compiled(jax.vmap(linalg.semidefinite_root))(A)
     assert np.all(root.semidefinite)
     L = np.asarray(root.factor)
     np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-13)
@@ -232,7 +233,7 @@ def test_root_tells_semidefinite_from_indefinite():
         for eigenvalues in (values, negative):
             A = (axes * eigenvalues[:, None]) @ axes.mT
             batches.append(0.5 * (A + A.mT) * units * units.mT)
-    judged = jax.jit(lambda A: [jax.vmap(linalg.semidefinite_root)(a) for a in A])(batches)
+    judged = compiled(lambda A: [jax.vmap(linalg.semidefinite_root)(a) for a in A])(batches)
     for on_cone, beyond in (judged[:2], judged[2:]):
         assert np.all(on_cone.semidefinite)
         assert not np.any(beyond.semidefinite)
@@ -241,12 +242,12 @@ def test_root_tells_semidefinite_from_indefinite():
 def test_root_of_a_negative_or_missing_variance_is_not_a_number():
     A = np.stack([np.eye(3)] * 4)
     A[1, 1, 1], A[2, 2, 2], A[3, 0, 1], A[3, 1, 0] = -1e-12, np.nan, np.nan, np.nan
-    root = jax.jit(jax.vmap(linalg.semidefinite_root))(A)
+    root = compiled(jax.vmap(linalg.semidefinite_root))(A)
     np.testing.assert_array_equal(root.semidefinite, [True, False, False, False])
     assert np.all(np.isnan(root.factor[1:3]))
 
 
-@jax.jit
+@compiled
 def downdates(pairs):
     return [jax.vmap(linalg.downdate)(*pair) for pair in pairs]
 
@@ -304,12 +305,12 @@ def test_derivatives_of_downdate():
     L, v = (jnp.asarray(part[:4]) for part in random_downdates(rng, 0.6)[1])
     weight = jnp.asarray(rng.standard_normal((3, 3)))
 
-    @jax.jit
+    @compiled
     def total(L, v):
         return jnp.sum(weight * linalg.downdate(L, v).factor)
 
     check_grads(jax.vmap(total), (L, v), order=1, modes=["fwd", "rev"], rtol=1e-7, atol=1e-7)
-    by_both = jax.jit(jax.vmap(jax.grad(total, argnums=(0, 1))))
+    by_both = compiled(jax.vmap(jax.grad(total, argnums=(0, 1))))
     of_L, of_v = by_both(L, 0 * v)
     np.testing.assert_allclose(of_L, jnp.tril(weight)[None] + 0 * L, atol=1e-15)
     np.testing.assert_allclose(of_v, 0, atol=1e-15)
@@ -318,8 +319,8 @@ def test_derivatives_of_downdate():
 
 def test_gradient_of_safe_norm_at_zero_and_beyond():
     x = jnp.array([[0.0, 0.0, 0.0], [3.0, 0.0, -4.0]])
-    value, reverse = jax.jit(jax.vmap(jax.value_and_grad(linalg.safe_norm)))(x)
-    forward = jax.jit(jax.vmap(jax.jacfwd(linalg.safe_norm)))(x)
+    value, reverse = compiled(jax.vmap(jax.value_and_grad(linalg.safe_norm)))(x)
+    forward = compiled(jax.vmap(jax.jacfwd(linalg.safe_norm)))(x)
     np.testing.assert_array_equal(value, [0, 5])
     for gradient in (forward, reverse):
         np.testing.assert_allclose(gradient, [[0, 0, 0], [0.6, 0, -0.8]], rtol=4e-16)

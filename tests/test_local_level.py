@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import WGS84, dcm_ne, ecef_from_geodetic, metres_per_radian
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import (
@@ -28,8 +29,8 @@ ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 EARTH_RATE = 7.292115e-5
 METRES = np.array([6.4e6, 6.4e6, 1.0])
 """Upper bounds of metres per radian of latitude and longitude."""
-mechanise = jax.jit(mechanise_local_level, static_argnames="every")
-tilts = jax.jit(jax.vmap(so3_local))
+mechanise = compiled(mechanise_local_level, static_argnames="every")
+tilts = compiled(jax.vmap(so3_local))
 
 
 class Errors(NamedTuple):
@@ -84,7 +85,7 @@ def test_pull_is_what_inertial_coordinates_say() -> None:
     bends = rng.normal(size=(20, 3)) * [1e-6, 1e-6, 10.0]
     w = jnp.array([0.0, 0.0, EARTH_RATE])
 
-    @jax.jit
+    @compiled
     @jax.vmap
     def both(p0: Array, p1: Array, p2: Array) -> tuple[Array, Array]:
         def position(t: Array) -> Array:
@@ -148,13 +149,13 @@ class Hour(NamedTuple):
 @cache
 def hour() -> Hour:
     start = jnp.array([55 * DEG, 37 * DEG, 150.0])
-    truth = jax.jit(lambda start: follow(swaying, weaving, start, steps=STEPS, step=STEP))(start)
+    truth = compiled(lambda start: follow(swaying, weaving, start, steps=STEPS, step=STEP))(start)
     time, p = np.asarray(truth.time), np.asarray(truth.state.position)
-    slope = np.asarray(jax.jit(jax.vmap(geodetic_rate))(p, truth.state.velocity))
+    slope = np.asarray(compiled(jax.vmap(geodetic_rate))(p, truth.state.velocity))
     # Hermite's cubic at the middle, right to 1e-12 m here
     middle = 0.5 * (p[:-1] + p[1:]) + STEP / 8 * (slope[:-1] - slope[1:])
     every = np.concatenate([time, time[:-1] + 0.5 * STEP]), np.concatenate([p, middle])
-    rate, force = map(np.asarray, jax.jit(jax.vmap(sensed))(*every))
+    rate, force = map(np.asarray, compiled(jax.vmap(sensed))(*every))
 
     def integral(x: np.ndarray) -> Array:
         ends, between = x[: STEPS + 1], x[STEPS + 1 :]
@@ -166,7 +167,7 @@ def hour() -> Hour:
 
 def test_coned_integrals_are_the_exact_rotation_vectors() -> None:
     truth, (dtheta, dvel), _ = hour()
-    turn, _ = jax.jit(coning_and_sculling)(dtheta, dvel)
+    turn, _ = compiled(coning_and_sculling)(dtheta, dvel)
     left, without = (np.abs(np.asarray(x - truth.dtheta))[1:].max() for x in (turn, dtheta))
     # What is left is of one order more in the step, a period of 10 s being 1000 steps.
     assert without > 5e-11
@@ -188,8 +189,8 @@ def test_an_hour_of_oscillation_from_increments_and_from_rates() -> None:
     def solved(dtheta: Array, dvel: Array) -> Errors:
         return errors(mechanise(start, dtheta, dvel, STEP, every=EVERY), true)
 
-    cone = jax.jit(coning_and_sculling)
-    rates = jax.jit(increments_from_rates)(*samples, jnp.full(STEPS, STEP))
+    cone = compiled(coning_and_sculling)
+    rates = compiled(increments_from_rates)(*samples, jnp.full(STEPS, STEP))
     coned, raw, sampled = solved(*cone(*integrals)), solved(*integrals), solved(*cone(*rates))
     exact = solved(truth.dtheta, cone(truth.dtheta, truth.dvel)[1])
     assert coned.position < 3e-3
@@ -215,7 +216,7 @@ def test_invalid_sample_is_held_and_never_used() -> None:
     held = [
         np.concatenate([np.zeros((1, 3)), x[1:4], x[3:4], x[3:4], x[6:]]) for x in (gyro, accel)
     ]
-    made = jax.jit(increments_from_rates)
+    made = compiled(increments_from_rates)
     expected = [0.005 * (x[:-1] + x[1:]) for x in held]
     outcomes = []
     for lost in (7.0, np.nan, np.inf):
@@ -228,7 +229,7 @@ def test_invalid_sample_is_held_and_never_used() -> None:
 def test_time_that_stands_still_or_goes_back_has_no_increment() -> None:
     """Row 21 of the hard inputs."""
     gyro, accel = np.random.default_rng(2).normal(size=(2, 4, 3))
-    dtheta, dvel = jax.jit(increments_from_rates)(gyro, accel, np.array([0.01, 0.0, -0.3]))
+    dtheta, dvel = compiled(increments_from_rates)(gyro, accel, np.array([0.01, 0.0, -0.3]))
     for got, rate in ((dtheta, gyro), (dvel, accel)):
         np.testing.assert_allclose(got[0], 0.005 * (rate[0] + rate[1]), rtol=1e-15)
         np.testing.assert_array_equal(got[1:], 0)
@@ -236,7 +237,7 @@ def test_time_that_stands_still_or_goes_back_has_no_increment() -> None:
 
 def test_constant_increments_are_compensated_for_the_turn_alone() -> None:
     dtheta, dvel = np.tile([0.01, 0.0, -0.01], (5, 1)), np.tile([0.0, 0.0, 0.1], (5, 1))
-    turn, gain = jax.jit(compensated)(dtheta, dvel)
+    turn, gain = compiled(compensated)(dtheta, dvel)
     np.testing.assert_allclose(turn, dtheta, rtol=1e-15, atol=1e-20)
     expected = np.tile([0.0, -0.5e-3, 0.1], (5, 1))
     np.testing.assert_allclose(gain, expected, rtol=1e-15, atol=1e-18)
@@ -291,7 +292,7 @@ def test_order_of_convergence() -> None:
     """Third order per step: the error falls by 8 when the step halves, by 4 without sculling."""
     start = jnp.array([34 * DEG, 108 * DEG, 500.0])
 
-    @jax.jit
+    @compiled
     def solved(step: float) -> tuple[NavState, NavState, NavState]:
         t = follow(
             lambda t: manoeuvre(t)[0], lambda t: manoeuvre(t)[1], start, steps=160, step=step

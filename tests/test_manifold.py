@@ -10,6 +10,7 @@ import pytest
 from jax import Array
 from oracles import rotations
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import moment_match
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.linearise import jacobians
@@ -82,7 +83,7 @@ def test_jacobians_are_the_derivatives(star: StarForm) -> None:
         )
         return Phi / units[None], H / units[None]
 
-    @jax.jit
+    @compiled
     def three_ways(state: SinsTotal, inputs: SinsTotalInput) -> list[tuple[Array, Array]]:
         automatic = model._replace(jacobians=None)
         return [
@@ -147,7 +148,7 @@ def test_transition_is_the_mechanisation() -> None:
         return x, x
 
     first = without_errors(start)
-    coarse = jax.jit(lambda u: jax.lax.scan(step, first, u)[1])(increments(1200))
+    coarse = compiled(lambda u: jax.lax.scan(step, first, u)[1])(increments(1200))
     np.testing.assert_allclose(coarse.dcm, fine.dcm, rtol=0, atol=1e-12)
     np.testing.assert_allclose(coarse.velocity, fine.velocity, rtol=0, atol=VELOCITY_ERROR)
     np.testing.assert_allclose(coarse.position, fine.position, rtol=0, atol=POSITION_ERROR)
@@ -229,7 +230,7 @@ def test_residual_of_rotation_vectors_near_and_at_half_a_turn() -> None:
     residual = MODELS["rotation-vector"].residual
     axis = np.array([0.6, 0.0, 0.8])
     small = np.array([1e-3, -2e-3, 5e-4])
-    graded = jax.jit(
+    graded = compiled(
         lambda a, b: (residual(a, b), jax.jacfwd(residual)(a, b), jax.jacrev(residual, 1)(a, b))
     )
     for angle in (np.pi - 1e-3, np.pi - 1e-9, np.pi):
@@ -242,9 +243,9 @@ def test_residual_of_rotation_vectors_near_and_at_half_a_turn() -> None:
 
 
 CENTRE, _ = random_states(np.random.default_rng(4), 1)
-turned = jax.jit(jax.vmap(lambda dx: retract(jax.tree.map(lambda leaf: leaf[0], CENTRE), dx)))
-match = jax.jit(lambda log_weights, members: moment_match(log_weights, members, retract, local))
-between = jax.jit(local)
+turned = compiled(jax.vmap(lambda dx: retract(jax.tree.map(lambda leaf: leaf[0], CENTRE), dx)))
+match = compiled(lambda log_weights, members: moment_match(log_weights, members, retract, local))
+between = compiled(local)
 
 
 def matched(weights: list[float], turns: list[np.ndarray]) -> tuple[SinsTotal, Gaussian]:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.metrics import (
     chi2_mean_bounds,
     mean_interval,
@@ -93,7 +94,7 @@ def test_bounds_of_a_mean_chi_square_as_printed(runs, degrees, wide, usual):
 def test_nees_equals_numpy_whatever_the_units():
     rng = np.random.default_rng(4)
 
-    @jax.jit
+    @compiled
     def batched(cases):
         return [jax.vmap(nees)(error, cov) for error, cov in cases]
 
@@ -118,5 +119,5 @@ def test_nees_of_an_indefinite_covariance_is_nan():
         [np.diag([1.0, 1.0, 1.0]), np.diag([1.0, -1e-9, 1.0]), np.ones((3, 3)), np.zeros((3, 3))]
     )
     covariances[2, 0, 1] = covariances[2, 1, 0] = 2
-    value = jax.jit(jax.vmap(nees, (None, 0)))(jnp.array([1.0, 2.0, 2.0]), covariances)
+    value = compiled(jax.vmap(nees, (None, 0)))(jnp.array([1.0, 2.0, 2.0]), covariances)
     np.testing.assert_array_equal(value, [9, np.nan, np.nan, np.nan])

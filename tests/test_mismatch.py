@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.mismatch import Mismatch, mismatched
 from jaxnav.estimation.run import run, simulate
@@ -56,11 +57,11 @@ def test_random_walk_has_the_variances_of_the_closed_form() -> None:
     """Matched, Q mis-set both ways, R mis-set both ways; in the limit sqrt((s + 1 / s) / 2)."""
     s = np.array([1.0, 2.0, 3.0, 10.0, 1 / 3, 1.0, 1.0])
     factor_r = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 9.0, 0.1])
-    compiled = jax.jit(jax.vmap(steady_walk))
+    program = compiled(jax.vmap(steady_walk))
     r = np.full(7, 4.0)
     for q in (4.0, 4e-3):
         told, wrong_r = q / s**2, factor_r * r
-        actual, believed = map(np.asarray, compiled(np.full(7, q), r, told, wrong_r))
+        actual, believed = map(np.asarray, program(np.full(7, q), r, told, wrong_r))
         np.testing.assert_allclose(believed, steady_variance(told, wrong_r), rtol=1e-10)
         K = steady_variance(told, wrong_r) / wrong_r
         expected = ((1 - K) ** 2 * q + K**2 * r) / (1 - (1 - K) ** 2)
@@ -122,8 +123,8 @@ def test_monte_carlo_has_the_analysed_covariance() -> None:
         return estimate.mean - x
 
     start = TRUE.initial.mean[None] + noise(np.eye(2))
-    errors = np.asarray(jax.jit(jax.vmap(one))(start, noise(Q, STEPS), noise(R, STEPS)))
-    estimate, believed, _ = jax.jit(analysed)(WRONG, jnp.zeros((STEPS, 2)))
+    errors = np.asarray(compiled(jax.vmap(one))(start, noise(Q, STEPS), noise(R, STEPS)))
+    estimate, believed, _ = compiled(analysed)(WRONG, jnp.zeros((STEPS, 2)))
     P = np.asarray(estimate.cov)
     sampled = np.einsum("nti,ntj->tij", errors, errors) / RUNS
     variance = np.diagonal(P, axis1=1, axis2=2)
@@ -137,7 +138,7 @@ def test_matched_analysis_is_the_filter_and_values_are_not_used() -> None:
     plain = run(
         ekf(MODEL), TRUE, jnp.zeros(STEPS), Obs(jnp.zeros((STEPS, 2)), jnp.array(VALID))
     ).record
-    one = jax.jit(analysed)
+    one = compiled(analysed)
     estimate, believed, info = one(TRUE, jnp.zeros((STEPS, 2)))
     np.testing.assert_allclose(estimate.cov, believed, rtol=1e-13, atol=1e-14)
     np.testing.assert_allclose(believed, plain[0].cov, rtol=1e-11, atol=1e-13)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.metrics import chi2_mean_bounds, mean_interval, nees, rmse_ratio
@@ -100,7 +101,7 @@ def test_flights_start_with_errors_from_the_prior() -> None:
             return local(true, flight.start)
 
         keys = jax.random.split(jax.random.key(3), 2000)
-        errors = np.asarray(jax.jit(jax.vmap(start_error))(keys))
+        errors = np.asarray(compiled(jax.vmap(start_error))(keys))
         sigma = np.asarray(world.prior_sigma)
         free = np.r_[3:15] if scenario == "large-misalignment" else np.r_[0:15]
         spread = errors.std(axis=0) / sigma
@@ -252,7 +253,7 @@ def test_matched_filters_are_consistent_and_mistuned_ones_are_not() -> None:
             truth = jax.tree.map(lambda leaf: leaf[epochs], flight.truth)
             return jax.vmap(nees)(jax.vmap(local)(truth, x), P)
 
-        @jax.jit
+        @compiled
         def over_runs(keys: jax.Array, share: jax.Array) -> jax.Array:
             return jax.lax.map(lambda key: one(key, share), keys, batch_size=25)
 

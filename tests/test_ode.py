@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav.compiling import compiled
 from jaxnav.numerics.ode import rk4
 
 
@@ -12,7 +13,7 @@ def test_order_four_on_a_pytree_with_a_known_solution():
         y = state["logistic"]
         return {"logistic": y * (1 - y), "lorentz": -2 * t * state["lorentz"] ** 2}
 
-    @jax.jit
+    @compiled
     def integrated(step, steps):
         def body(k, state):
             return rk4(derivative, k * step, state, step)
@@ -40,7 +41,7 @@ def test_a_cubic_in_time_is_integrated_exactly():
     def advance(t, y):
         return rk4(lambda t, y: 4 * t**3 + jnp.zeros_like(y), t, y, 2.0)
 
-    np.testing.assert_allclose(jax.jit(advance)(1.0, np.zeros(2)), 3.0**4 - 1, rtol=1e-15)
+    np.testing.assert_allclose(compiled(advance)(1.0, np.zeros(2)), 3.0**4 - 1, rtol=1e-15)
 
 
 def test_gradient_by_the_step():
@@ -49,5 +50,5 @@ def test_gradient_by_the_step():
 
     h = 0.3
     np.testing.assert_allclose(
-        jax.jit(jax.grad(decayed))(h), -1 + h - h**2 / 2 + h**3 / 6, rtol=1e-14
+        compiled(jax.grad(decayed))(h), -1 + h - h**2 / 2 + h**3 / 6, rtol=1e-14
     )

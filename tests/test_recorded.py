@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
+from jaxnav.compiling import compiled
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog, Reference
 from jaxnav.datasets.formats import load_drive
@@ -135,7 +136,7 @@ def test_jacobian_of_all_channels_agrees_with_the_automatic_one(form: LevelError
         axle=jnp.array([-1.2, 0.1, -1.0]),
     )
     model = vehicle(form, origin)
-    own, automatic = jax.jit(
+    own, automatic = compiled(
         lambda x: [
             jacobians(m, params, x, u, 15)[1] for m in (model, model._replace(jacobians=None))
         ]

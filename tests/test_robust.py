@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.robust import Correntropy, Versoria, correntropy, versoria
@@ -67,8 +68,8 @@ def test_update_equals_the_loop_of_reweighted_updates(kind: str, iterations: int
         Obs(jnp.array(z), jnp.array(valid)),
     )
     filter = build(ekf, STATIC, iterations=iterations)
-    estimate, info = jax.jit(jax.vmap(partial(updated, filter)))(*given)
-    plain = jax.jit(jax.vmap(partial(updated, ekf(STATIC))))(*given)[1]
+    estimate, info = compiled(jax.vmap(partial(updated, filter)))(*given)
+    plain = compiled(jax.vmap(partial(updated, ekf(STATIC))))(*given)[1]
     for k in range(count):
         weight = {
             "versoria": lambda e, k=k: versoria_weight(e, width[k], power[k]),
@@ -110,7 +111,7 @@ def test_fixed_point_is_the_least_of_the_criterion(kind: str) -> None:
     filter = build(ekf, STATIC)
     prior, noise, obs = scalar(0.0, variance, z)
     kernels = jax.tree.map(lambda leaf: jnp.full(9, leaf), kernel)
-    estimate, _ = jax.jit(jax.vmap(partial(updated, filter)))(kernels, prior, noise, obs)
+    estimate, _ = compiled(jax.vmap(partial(updated, filter)))(kernels, prior, noise, obs)
     grid = np.linspace(-1, 5, 600_001)
     losses: dict[str, Callable[[np.ndarray], np.ndarray]] = {
         "versoria": lambda e: -1 / (1 + 0.1 * e**2) / (2 * 0.1),
@@ -136,15 +137,17 @@ def test_outlier_is_thrown_away_and_good_data_after_a_poor_prior_is_not(kind: st
     build = {"versoria": versoria, "correntropy": correntropy}[kind]
     # prior variance, measurement
     cases = scalar(0.0, np.array([0.25, 1.0, 1e4, 1e4]), np.array([100.0, 100.0, 80.0, -150.0]))
-    robust, _ = jax.jit(jax.vmap(partial(updated, build(ekf, STATIC)), (None, 0, 0, 0)))((), *cases)
-    plain, _ = jax.jit(jax.vmap(partial(updated, ekf(STATIC)), (None, 0, 0, 0)))((), *cases)
+    robust, _ = compiled(jax.vmap(partial(updated, build(ekf, STATIC)), (None, 0, 0, 0)))(
+        (), *cases
+    )
+    plain, _ = compiled(jax.vmap(partial(updated, ekf(STATIC)), (None, 0, 0, 0)))((), *cases)
     share = np.asarray(robust.mean / plain.mean)[:, 0]
     assert np.all(np.abs(share[:2]) < 0.02)
     np.testing.assert_allclose(share[2:], 1, rtol=1e-4)
     assert np.all(np.asarray(robust.cov)[2:, 0, 0] < 1.001)
     # The second kernel of the class is its default.
     named = {"versoria": Versoria(), "correntropy": Correntropy()}[kind]
-    again, _ = jax.jit(jax.vmap(partial(updated, build(ekf, STATIC)), (None, 0, 0, 0)))(
+    again, _ = compiled(jax.vmap(partial(updated, build(ekf, STATIC)), (None, 0, 0, 0)))(
         named, *cases
     )
     np.testing.assert_array_equal(again.mean, robust.mean)
@@ -181,7 +184,7 @@ def test_gradients_by_the_kernel_are_right_also_at_a_zero_residual() -> None:
             total = total + direction @ mean + np.sum(cov)
         return total
 
-    by_kernel, by_data = jax.jit(jax.vmap(jax.grad(loss, (0, 1)), (None, 0)))(point, data)
+    by_kernel, by_data = compiled(jax.vmap(jax.grad(loss, (0, 1)), (None, 0)))(point, data)
     for k, z in enumerate(data):
         expected = [
             central_difference(lambda t, z=z: looped(t, z), point, e, 1e-3) for e in np.eye(3)
@@ -250,7 +253,9 @@ def sample(seed: int, runs: int, steps: int) -> Sample:
     v = rng.normal(size=(runs, steps, 2)) @ np.linalg.cholesky(R).T
     outlier = rng.uniform(size=(runs, steps, 1)) < 0.05
     start = rng.normal(size=(runs, 2))
-    move = jax.jit(jax.vmap(lambda x, w, v: simulate(MOVING, TRUE, x, jnp.zeros(w.shape[0]), w, v)))
+    move = compiled(
+        jax.vmap(lambda x, w, v: simulate(MOVING, TRUE, x, jnp.zeros(w.shape[0]), w, v))
+    )
     x, z = move(start, w, v)
     return Sample(x, z, z + jnp.array(np.where(outlier, 9.0, 0.0) * v))
 
@@ -262,7 +267,7 @@ def means(filter: Filter, params: FilterParams, z: Array) -> np.ndarray:
         obs = Obs(z, jnp.ones(z.shape, bool))
         return run(filter, params, jnp.zeros(z.shape[0]), obs).record[0].mean
 
-    return np.asarray(jax.jit(jax.vmap(one))(z))
+    return np.asarray(compiled(jax.vmap(one))(z))
 
 
 def rms(errors: np.ndarray) -> np.ndarray:
@@ -304,7 +309,7 @@ def test_adaptive_filter_equals_the_loop() -> None:
     )
     filter = innovation_adaptive(ekf, MOVING)
 
-    @jax.jit
+    @compiled
     def one(memory: Array, low: Array, high: Array) -> tuple[Array, Array]:
         params = FilterParams(TRUE, PRIOR, adaptation=Adaptation(memory, low, high))
         return run(
@@ -345,7 +350,7 @@ def test_adaptive_filter_finds_a_process_noise_off_by_ten_in_sigma() -> None:
         ).record
 
     offs = jnp.array([1e-2, 1.0, 1e2])
-    mean, log_factor = jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(offs, data.z)
+    mean, log_factor = compiled(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(offs, data.z)
     off = np.asarray(log_factor)[:, :, -1] + np.log(np.asarray(offs))[:, None]
     # From run to run 0.25; what comes from far above is still on its way, a step is at most 1 / 50.
     assert np.all(np.abs(off.mean(axis=1)) < 0.25), off.mean(axis=1)
@@ -386,7 +391,7 @@ def test_gradient_of_a_run(kind: str) -> None:
         return jnp.sum(estimate.mean**2) - jnp.sum(info.log_likelihood)
 
     point = np.array([-2.0, 0.1, 0.05, 2.0])
-    value, gradient = jax.jit(loss), jax.jit(jax.grad(loss))(point)
+    value, gradient = compiled(loss), compiled(jax.grad(loss))(point)
     expected = [
         central_difference(lambda t: np.asarray(value(t)), point, e, 1e-4) for e in np.eye(4)
     ]

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from oracles import rotations, sins
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.trajectory.base import smooth_step
 from jaxnav.navigation.trajectory.rocket import RocketProfile, attitude, axial_force, fly
 from jaxnav.units import DEG
@@ -57,7 +58,7 @@ def test_smooth_step_has_two_continuous_derivatives():
     c = np.clip(s, 0, 1)
     first = jax.grad(smooth_step)
     value, slope, curvature = (
-        jax.jit(jax.vmap(f))(s) for f in (smooth_step, first, jax.grad(first))
+        compiled(jax.vmap(f))(s) for f in (smooth_step, first, jax.grad(first))
     )
     np.testing.assert_allclose(value, 10 * c**3 - 15 * c**4 + 6 * c**5, rtol=0, atol=1e-14)
     np.testing.assert_allclose(slope, 30 * c**2 * (1 - c) ** 2, rtol=0, atol=1e-14)
@@ -71,7 +72,7 @@ def test_smooth_step_has_two_continuous_derivatives():
 def test_attitude_is_that_of_the_profile():
     p = RocketProfile()
     time = np.array([0.0, 10.0, 70.0, 130.0, 131.0, 166.0])
-    C = np.asarray(jax.jit(jax.vmap(partial(attitude, p)))(time))
+    C = np.asarray(compiled(jax.vmap(partial(attitude, p)))(time))
     # Half-way through the pitch-over it has done half; at 166 s the sway is at its quarter period
     # of 60 s and a third, 35 s after the cut-off, and the free motion is fully on.
     phase = 2 * np.pi * 35.0 / 60.0
@@ -105,7 +106,7 @@ def test_velocity_increments_add_up_to_the_burn():
     np.testing.assert_allclose(total[12_999], burn, rtol=1e-12)
     np.testing.assert_allclose(total[-1], burn + tail, rtol=1e-12)
     np.testing.assert_array_equal(truth.dvel[13_100:], 0)
-    force = jax.jit(partial(axial_force, p))(np.array([0.0, 65.0, 130.0, 130.5, 131.0, 600.0]))
+    force = compiled(partial(axial_force, p))(np.array([0.0, 65.0, 130.0, 130.5, 131.0, 600.0]))
     middle = 0.5 * (p.accel_end + 0.5 * slope)
     np.testing.assert_allclose(force, [18, 31.5, 45, middle, 0, 0], rtol=1e-15)
 

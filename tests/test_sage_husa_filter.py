@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.adaptive import Adaptation
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.filters.sage_husa import SageHusa, averaging, sage_husa
@@ -135,20 +136,20 @@ def built(name: str) -> Filter:
 
 
 @cache
-def compiled(name: str) -> Callable[..., Any]:
+def program(name: str) -> Callable[..., Any]:
     """The runs of all cases: states and infos after each step."""
     filter = built(name)
 
     def one(params: FilterParams, grade: Array, obs: Obs) -> Any:
         return run(filter, params, grade, obs, record=lambda state, info: (state, info)).record
 
-    return jax.jit(jax.vmap(one))
+    return compiled(jax.vmap(one))
 
 
 @cache
 def ran(name: str) -> Any:
     """States and infos of the cases, as NumPy arrays."""
-    found = compiled(name)(members(), DATA.grade, Obs(jnp.array(DATA.z), jnp.array(DATA.valid)))
+    found = program(name)(members(), DATA.grade, Obs(jnp.array(DATA.z), jnp.array(DATA.valid)))
     return jax.tree.map(np.asarray, found)
 
 
@@ -273,7 +274,7 @@ def test_smooth_clamp_tends_to_the_hard_one() -> None:
     cases = [NAMES.index(case) for case in ("forgetting", "endless")]
 
     def off(temperature: float) -> float:
-        found = compiled("clamped, smooth")(members(temperature), DATA.grade, obs)[0].noise
+        found = program("clamped, smooth")(members(temperature), DATA.grade, obs)[0].noise
         return float(np.abs(np.asarray(found) - hard)[cases].max())
 
     assert 1e-3 < off(1e-2) < 1e-1
@@ -302,7 +303,7 @@ def long_run(name: str) -> Callable[..., tuple[Array, Array]]:
         grade = jnp.ones(LONG)
         return run(filter, params, grade, obs, record=lambda s, i: (s.noise, i.flags)).record
 
-    return jax.jit(one)
+    return compiled(one)
 
 
 def long_noise(
@@ -364,7 +365,7 @@ def test_dtype_in_is_dtype_out(name: str) -> None:
 def test_share_of_a_sample() -> None:
     """As the weight among those before, through b = 1, and the same with many digits near it."""
     count = np.array([0.0, 1.0, 7.0, 1e6, np.inf])
-    found = jax.jit(jax.vmap(averaging, (0, None)))
+    found = compiled(jax.vmap(averaging, (0, None)))
     b = np.array([0.5, 0.97, 1.0])
     expected = [loop.share(loop.Averaging(each, 0.0, 0.0, 0.0), count) for each in b]
     np.testing.assert_allclose(found(b, count), expected, rtol=1e-13)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, bank
 from jaxnav.estimation.banks.weights import Penalty, penalty
 from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
@@ -39,7 +40,7 @@ def graded_data() -> tuple[Array, Obs]:
 
 def check_gradient(loss: Callable[[Array], Array], points: list[np.ndarray]) -> None:
     """Compare with central differences, by those parameters that are finite."""
-    both = jax.jit(jax.value_and_grad(loss))
+    both = compiled(jax.value_and_grad(loss))
     for point in points:
         axes = np.eye(len(point))[np.isfinite(point)]
         expected = [
@@ -110,7 +111,7 @@ def test_gradient_of_the_smooth_clamp_at_and_beyond_the_bounds() -> None:
 
     told = np.array([0.6, 0.9, low, 1.5, high, 2.2, 3.0])
     z = np.sqrt(2 * told - 1)
-    value, gradient = jax.jit(jax.vmap(jax.value_and_grad(variance)))(z)
+    value, gradient = compiled(jax.vmap(jax.value_and_grad(variance)))(z)
     above, below = (1 / (1 + np.exp(-(told - bound) / width)) for bound in (low, high))
     np.testing.assert_allclose(gradient, (above - below) * z, rtol=1e-9)
     assert np.all(gradient > 1e-5)

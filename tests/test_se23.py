@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import expm
 
+from jaxnav.compiling import compiled
 from jaxnav.numerics.lie import so3_left_jacobian, so3_left_jacobian_inverse, wrapped_angle
 from jaxnav.numerics.se23 import (
     ExtendedPose,
@@ -25,8 +26,8 @@ ANGLES = np.array(
         *(0.1, 1.0, 2.0, 3.0, np.pi - 1e-3, np.pi - 1e-6),
     ]
 )
-exp, log = jax.jit(jax.vmap(se23_exp)), jax.jit(jax.vmap(se23_log))
-multiply, inverse = jax.jit(jax.vmap(se23_multiply)), jax.jit(jax.vmap(se23_inverse))
+exp, log = compiled(jax.vmap(se23_exp)), compiled(jax.vmap(se23_log))
+multiply, inverse = compiled(jax.vmap(se23_multiply)), compiled(jax.vmap(se23_inverse))
 
 
 def tangents(angles: np.ndarray = ANGLES, per_angle: int = 4) -> np.ndarray:
@@ -89,7 +90,7 @@ def test_log_undoes_exp_from_zero_to_near_pi() -> None:
 def test_adjoint_moves_an_exponential_to_the_other_side() -> None:
     xi = tangents()
     X = exp(np.roll(xi, 11, axis=0))
-    Ad = np.asarray(jax.jit(jax.vmap(se23_adjoint))(X))
+    Ad = np.asarray(compiled(jax.vmap(se23_adjoint))(X))
     through = exp((Ad @ xi[:, :, None])[..., 0])
     around = multiply(multiply(X, exp(xi)), inverse(X))
     np.testing.assert_allclose(matrices(through), matrices(around), rtol=0, atol=1e-12)
@@ -106,7 +107,7 @@ def test_left_jacobian_and_its_inverse() -> None:
     """Also beyond pi, up to where a full turn makes the Jacobian singular."""
     phi = tangents(np.append(ANGLES, [np.pi, 4.0, 6.0]))[:, :3]
     J = np.array([rotations.left_jacobian(p) for p in phi])
-    both = jax.jit(jax.vmap(lambda p: (so3_left_jacobian(p), so3_left_jacobian_inverse(p))))
+    both = compiled(jax.vmap(lambda p: (so3_left_jacobian(p), so3_left_jacobian_inverse(p))))
     own, inverse = map(np.asarray, both(phi))
     one = np.broadcast_to(np.eye(3), J.shape)
     np.testing.assert_allclose(own @ inverse, one, rtol=0, atol=3e-14)
@@ -124,7 +125,7 @@ def test_derivatives_are_right_and_finite_at_zero() -> None:
         X = se23_exp(x)
         return jnp.concatenate([X.C.reshape(-1), X.v, X.p])
 
-    @jax.jit
+    @compiled
     @jax.vmap
     def derivatives(x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         of_inverse = jax.jacfwd(so3_left_jacobian_inverse)(x[:3])
@@ -152,12 +153,12 @@ def test_derivatives_are_right_and_finite_at_zero() -> None:
 
 def test_differences_of_angles_are_within_half_a_turn() -> None:
     """Row 23 of the hard inputs: a heading that goes through pi has a small innovation."""
-    wrapped = jax.jit(jax.vmap(wrapped_angle))
+    wrapped = compiled(jax.vmap(wrapped_angle))
     a, b = np.array([np.pi - 0.005, -np.pi + 0.005, 0.3, 7 * np.pi, np.pi, 1.0]), np.zeros(6)
     b[:2] = -a[:2]
     expected = [-0.01, 0.01, 0.3, -np.pi, -np.pi, 1.0]
     np.testing.assert_allclose(wrapped(a, b), expected, rtol=0, atol=5e-15)
     exact = np.random.default_rng(4).uniform(-3, 3, 50)
     np.testing.assert_array_equal(wrapped(exact, np.zeros(50)), exact)
-    slope = jax.jit(jax.vmap(jax.grad(wrapped_angle, (0, 1))))(a, b)
+    slope = compiled(jax.vmap(jax.grad(wrapped_angle, (0, 1))))(a, b)
     np.testing.assert_array_equal(slope, [np.ones(6), -np.ones(6)])

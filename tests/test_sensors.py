@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt, markov_error
 from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.numerics.lie import so3_exp, so3_log
@@ -37,7 +38,7 @@ def test_imu_noise_drift_and_bias(key):
     rng = np.random.default_rng(1)
     dtheta, dvel = 1e-4 * rng.standard_normal((2, COUNT, 3))
     scale = np.repeat([1.0, 10.0, 0.0, 1e4], COUNT // 4)
-    measured = jax.jit(corrupt)(key, errors, dtheta, dvel, STEP, scale)
+    measured = compiled(corrupt)(key, errors, dtheta, dvel, STEP, scale)
     constant = STEP * np.concatenate([drift, bias])
     sigma = STEP * np.concatenate([gyro_noise, accel_noise])
     noise = np.concatenate(measured, axis=1) - np.concatenate([dtheta, dvel], axis=1) - constant
@@ -52,7 +53,7 @@ def test_increments_pass_a_perfect_imu_unchanged(key):
     zero = jnp.zeros(3)
     dtheta, dvel = 1e-3 * np.random.default_rng(2).standard_normal((2, 10, 3))
     perfect = ImuErrors(zero, zero, zero, zero)
-    measured = jax.jit(corrupt)(key, perfect, dtheta, dvel, STEP, np.ones(10))
+    measured = compiled(corrupt)(key, perfect, dtheta, dvel, STEP, np.ones(10))
     np.testing.assert_array_equal(measured, [dtheta, dvel])
 
 
@@ -60,7 +61,7 @@ def test_constant_bias_is_the_same_for_every_interval(key):
     dtheta, dvel = 1e-3 * np.random.default_rng(4).standard_normal((2, 1000, 3))
     vector = jnp.array([1e-3, -2e-3, 3e-4])
     noise = jnp.ones(3)
-    run = jax.jit(corrupt)
+    run = compiled(corrupt)
     measured = [
         run(key, ImuErrors(noise, noise, 0 * noise, bias), dtheta, dvel, STEP, np.ones(1000))
         for bias in (vector, jnp.broadcast_to(vector, (1000, 3)))
@@ -73,7 +74,7 @@ def test_bias_of_each_interval_enters_its_velocity_increment(key):
     dtheta, dvel, bias = np.random.default_rng(5).standard_normal((3, 50, 3))
     errors = ImuErrors(zero, zero, zero, jnp.asarray(bias))
     scale = jnp.ones(50)
-    measured = jax.jit(corrupt)(key, errors, dtheta, dvel, STEP, scale)
+    measured = compiled(corrupt)(key, errors, dtheta, dvel, STEP, scale)
     np.testing.assert_array_equal(measured[0], dtheta)
     np.testing.assert_allclose(measured[1], dvel + STEP * bias, rtol=0, atol=1e-15)
     three = ImuErrors(zero, zero, zero, jnp.asarray(bias[:3]))
@@ -85,7 +86,7 @@ def test_markov_error_is_stationary_and_forgets_over_its_correlation_time(key):
     runs, count, tau, step = 40_000, 41, 2.0, 0.1
     sigma = np.array([50.0, 5.0, 500.0]) * MICRO_G
 
-    @jax.jit
+    @compiled
     def histories(key):
         start_key, key = jax.random.split(key)
         start = sigma[None] * jax.random.normal(start_key, (runs, 3))
@@ -131,9 +132,9 @@ def test_markov_error_decays_from_its_start(key):
 def test_star_tracker_errs_in_inertial_axes(key):
     sigma = np.array([1.0, 3.0, 10.0]) * ARCSEC
     rng = np.random.default_rng(3)
-    attitudes = jax.jit(jax.vmap(so3_exp))(rng.standard_normal((50_000, 3)))
+    attitudes = compiled(jax.vmap(so3_exp))(rng.standard_normal((50_000, 3)))
 
-    @jax.jit
+    @compiled
     def observed(key, attitudes, noise):
         measured = observe_attitude(key, attitudes, noise)
         return measured, jax.vmap(lambda M, C: so3_log(M @ C.T))(measured, attitudes)

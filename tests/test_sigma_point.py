@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ckf, drawn, square_root_ukf, ukf
 from jaxnav.estimation.run import run
@@ -118,14 +119,14 @@ def test_rule_of_the_parameters_equals_the_keyword() -> None:
 
 @pytest.mark.parametrize("filter", [UKF, SQUARE_ROOT_UKF])
 def test_gradient_by_alpha(filter: Filter) -> None:
-    @jax.jit
+    @compiled
     def loss(alpha: Array) -> Array:
         params = PARAMS._replace(sigma=unscented(2, alpha=alpha))
         return negative_log_likelihood(filter, params, jnp.zeros(STEPS), OBS)
 
     numeric = (loss(jnp.array(0.8 + 1e-5)) - loss(jnp.array(0.8 - 1e-5))) / 2e-5
     assert abs(numeric) > 1e-6
-    np.testing.assert_allclose(jax.jit(jax.grad(loss))(jnp.array(0.8)), numeric, rtol=1e-6)
+    np.testing.assert_allclose(compiled(jax.grad(loss))(jnp.array(0.8)), numeric, rtol=1e-6)
 
 
 def squares(count: int) -> Model:
@@ -144,7 +145,7 @@ def one_update(filter: Filter, params: FilterParams, z: float) -> tuple[Gaussian
         state, info = filter.update(params, filter.init(params), jnp.zeros(()), obs)
         return filter.estimate(state), info
 
-    return jax.jit(update)(params, jnp.array([z]))
+    return compiled(update)(params, jnp.array([z]))
 
 
 def test_square_of_a_gaussian_has_its_exact_moments() -> None:

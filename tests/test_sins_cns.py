@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from oracles import rotations, sins
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.models.sins_cns import (
     ATTITUDE_LAYOUT,
     LAYOUT,
@@ -44,7 +45,7 @@ def inputs():
 
 
 def over_steps(function, *args):
-    return np.asarray(jax.jit(jax.vmap(function, (0, *(None for _ in args))))(inputs(), *args))
+    return np.asarray(compiled(jax.vmap(function, (0, *(None for _ in args))))(inputs(), *args))
 
 
 def dense_transitions():
@@ -105,7 +106,7 @@ def test_the_attitude_model_is_a_block_of_the_whole():
         )
         return whole, alone
 
-    whole, alone = jax.jit(jax.vmap(both, (0, None, None)))(inputs(), x, part)
+    whole, alone = compiled(jax.vmap(both, (0, None, None)))(inputs(), x, part)
     np.testing.assert_array_equal(whole[0][pick], alone[0])
     np.testing.assert_allclose(np.asarray(whole[1])[:, ATTITUDE_STATES], alone[1], rtol=1e-15)
     for a, b in zip(whole[2:], alone[2:], strict=True):
@@ -119,7 +120,7 @@ def test_misalignment_is_computed_against_reference():
     phi = rng.standard_normal((20, 3)) * 10.0 ** rng.uniform(-6, 0, (20, 1))
     C = np.array([rotations.exp(p) for p in 2 * rng.standard_normal((20, 3))])
     computed = np.array([rotations.exp(p) for p in phi]) @ C
-    measure = jax.jit(jax.vmap(so3_local))
+    measure = compiled(jax.vmap(so3_local))
     np.testing.assert_allclose(measure(C, computed), phi, rtol=0, atol=3e-15)
     np.testing.assert_allclose(measure(computed, C), -phi, rtol=0, atol=3e-15)
 
@@ -133,7 +134,7 @@ def test_inputs_are_means_over_the_period():
     start = jax.tree.map(lambda leaf: leaf[0], state)
     ends = jax.tree.map(lambda leaf: leaf[1:], state)
     scale = np.arange(3.0)
-    u = jax.jit(inputs_from_solution)(
+    u = compiled(inputs_from_solution)(
         start, NavSolution(ends, jnp.asarray(gained)), PERIOD, RADIUS, scale
     )
     np.testing.assert_allclose(u.dcm, 0.5 * (dcm[:-1] + dcm[1:]), rtol=0, atol=1e-16)

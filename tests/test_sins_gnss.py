@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.linearise import jacobians
 from jaxnav.estimation.run import Trace, run
@@ -64,10 +65,10 @@ def test_local_undoes_retract(form: LevelError) -> None:
     rng = np.random.default_rng(2)
     dx = jnp.array(rng.normal(size=(50, 15)) * np.repeat([0.5, 30.0, 100.0, 1e-3, 1e-2], 3))
     x = states(50)
-    back = jax.jit(jax.vmap(lambda x, d: e.local(x, e.retract(x, d))))(x, dx)
+    back = compiled(jax.vmap(lambda x, d: e.local(x, e.retract(x, d))))(x, dx)
     # metres per radian are those at the one point or at the other: 100 m turn a latitude by 2e-5
     np.testing.assert_allclose(back, dx, rtol=2e-4, atol=1e-8)
-    small = jax.jit(jax.vmap(lambda x, d: e.local(x, e.retract(x, d))))(x, 1e-4 * dx)
+    small = compiled(jax.vmap(lambda x, d: e.local(x, e.retract(x, d))))(x, 1e-4 * dx)
     np.testing.assert_allclose(small, 1e-4 * dx, rtol=1e-6, atol=2e-8)
 
 
@@ -83,8 +84,8 @@ def test_to_additive_is_the_derivative_of_retract(form: LevelError) -> None:
         return columns, jax.vmap(lambda d: e.from_additive(x, d), 1, 1)(columns)
 
     x = states(20)
-    forward, both = jax.jit(jax.vmap(given))(x)
-    np.testing.assert_allclose(jax.jit(jax.vmap(derivative))(x), forward, rtol=1e-8, atol=1e-6)
+    forward, both = compiled(jax.vmap(given))(x)
+    np.testing.assert_allclose(compiled(jax.vmap(derivative))(x), forward, rtol=1e-8, atol=1e-6)
     np.testing.assert_allclose(both, np.broadcast_to(np.eye(15), both.shape), atol=1e-9)
 
 
@@ -102,7 +103,7 @@ def test_analytic_jacobians_agree_with_automatic_ones(form: LevelError) -> None:
         own = jacobians(model, PARAMS, x, sensed(), 15)
         return own, jacobians(model._replace(jacobians=None), PARAMS, x, sensed(), 15)
 
-    (Phi, H), (auto_Phi, auto_H) = jax.jit(jax.vmap(both))(x)
+    (Phi, H), (auto_Phi, auto_H) = compiled(jax.vmap(both))(x)
     channels = np.repeat([0.1, 3.0], 3)
     for k in range(12):
         off = np.abs(relative(Phi[k]) - relative(auto_Phi[k]))
@@ -121,7 +122,7 @@ def test_jacobian_is_exact_where_the_earth_is_flat() -> None:
         auto = model._replace(jacobians=None)
         return [jacobians(m, PARAMS, x, sensed(), 15)[0] for m in (model, auto)]
 
-    own, automatic = jax.jit(jax.vmap(both))(x)
+    own, automatic = compiled(jax.vmap(both))(x)
     np.testing.assert_allclose(own, automatic, rtol=1e-9, atol=1e-9)
 
 
@@ -134,7 +135,7 @@ def test_invariant_errors_move_alike_everywhere_on_a_flat_earth(form: LevelError
         forms = (model, model._replace(jacobians=None))
         return [jacobians(m, PARAMS, x, sensed(), 15)[0][:9, :9] for m in forms]
 
-    for Phi in jax.jit(jax.vmap(transitions))(states(30, jnp.zeros(3), biased=0.0)):
+    for Phi in compiled(jax.vmap(transitions))(states(30, jnp.zeros(3), biased=0.0)):
         alike = np.broadcast_to(Phi[0], Phi.shape)
         np.testing.assert_allclose(Phi, alike, rtol=1e-9, atol=1e-9)
         assert np.abs(Phi[0] - np.eye(9)).max() > 0.01
@@ -143,7 +144,7 @@ def test_invariant_errors_move_alike_everywhere_on_a_flat_earth(form: LevelError
 def test_additive_error_moves_with_the_attitude() -> None:
     model = sins_gnss("additive", earth=FLAT)
     x = states(2, jnp.zeros(3), biased=0.0)
-    Phi = jax.jit(jax.vmap(lambda x: jacobians(model, PARAMS, x, sensed(), 15)[0]))(x)
+    Phi = compiled(jax.vmap(lambda x: jacobians(model, PARAMS, x, sensed(), 15)[0]))(x)
     assert np.abs(Phi[0, :9, :9] - Phi[1, :9, :9]).max() > 0.1
 
 
@@ -173,7 +174,7 @@ def drive(form: LevelError, earth: Earth = WGS84):
     x = jax.tree.map(lambda leaf: leaf[0], states(1))
     prior = Gaussian(x, jnp.diag(jnp.array(SIGMA) ** 2))
 
-    @jax.jit
+    @compiled
     def one(inputs: SinsGnssInput, obs: Obs) -> Trace:
         return run(filter, FilterParams(PARAMS, prior), inputs, obs)
 
@@ -200,7 +201,7 @@ def fixes(x: SinsLevel, inputs: SinsGnssInput) -> Obs:
     return Obs(jnp.array(np.array(z) + noise), jnp.array(valid))
 
 
-MOVE = jax.jit(lambda x, u: sins_gnss().transition(PARAMS, x, u))
+MOVE = compiled(lambda x, u: sins_gnss().transition(PARAMS, x, u))
 
 
 def test_nan_in_any_channel_equals_the_masked_run_bitwise() -> None:
@@ -278,7 +279,7 @@ def test_filters_of_all_definitions_are_one_where_errors_are_small() -> None:
 
     ahead = MOVE(x, sensed())
     z = sins_gnss().observe(PARAMS, ahead, sensed()) + small * jnp.array(off)
-    found = jax.jit(posteriors)(Obs(z, jnp.ones(6, bool)))
+    found = compiled(posteriors)(Obs(z, jnp.ones(6, bool)))
     # in sigmas: what the analytic Jacobians leave out is below a thousandth
     scale = small * SIGMA
     first, *others = [(mean / scale, cov / np.outer(scale, scale)) for mean, cov in found]

@@ -9,6 +9,7 @@ import pytest
 from jax import Array
 from scipy.integrate import solve_ivp
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.filters.iterated import modified_iterated_ckf
 from jaxnav.estimation.filters.sigma_point import ckf
 from jaxnav.estimation.types import FilterParams, Flag, Gaussian, Model, Obs
@@ -30,14 +31,14 @@ from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 PERIOD, IMU_STEP = 1.0, 0.01
 
 
-def compiled(model: Model) -> Model:
+def program(model: Model) -> Model:
     """A model whose equations are programs: a kernel for every operation takes longer."""
     equations = ("transition", "process_noise", "observe", "observation_noise")
-    return model._replace(**{name: jax.jit(getattr(model, name)) for name in equations})
+    return model._replace(**{name: compiled(getattr(model, name)) for name in equations})
 
 
-HEIGHTS = compiled(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS))
-ANGLES = compiled(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, "angle"))
+HEIGHTS = program(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS))
+ANGLES = program(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, "angle"))
 MODELS: dict[RayForm, Model] = {"height": HEIGHTS, "angle": ANGLES}
 CENTRE = np.array([0.0, MEAN_RADIUS, 0.0])
 
@@ -91,7 +92,7 @@ def seen() -> SinsRkcnsInput:
     x = state()
     star = limb_stars(x, (20.9e3, 23.5e3, 26.0e3))
     position, given = x.position + jnp.array(CENTRE), table()
-    angle = jax.jit(jax.vmap(lambda s: seen_refraction(given, position, s).angle))(star)
+    angle = compiled(jax.vmap(lambda s: seen_refraction(given, position, s).angle))(star)
     return SinsRkcnsInput(jnp.array([0.01, -0.02, 0.03]), star, angle, jnp.array(1.0))
 
 
@@ -107,7 +108,7 @@ def test_the_vehicle_falls_freely_and_the_gyros_less_their_drift_turn_it() -> No
     end = solve_ivp(derivative, (0, PERIOD), start, rtol=1e-13, atol=1e-9).y[:, -1]
     np.testing.assert_allclose(moved.velocity, end[:3], atol=1e-9)
     np.testing.assert_allclose(moved.position, end[3:], atol=1e-8)
-    turned = x.dcm @ jax.jit(so3_exp)(u.dtheta - PERIOD * x.drift)
+    turned = x.dcm @ compiled(so3_exp)(u.dtheta - PERIOD * x.drift)
     np.testing.assert_allclose(moved.dcm, turned, atol=1e-15)
     np.testing.assert_array_equal(moved.bias, x.bias)
     np.testing.assert_array_equal(moved.drift, x.drift)
@@ -147,7 +148,7 @@ def test_the_forms_have_the_same_slope_of_height_by_position() -> None:
             at = retract(x, jnp.zeros(15).at[LAYOUT.dr].set(dr))
             return MODELS[form].observe(given, at, u)[3:6]
 
-        return jax.jit(jax.jacfwd(channels))(jnp.zeros(3))
+        return compiled(jax.jacfwd(channels))(jnp.zeros(3))
 
     by_height, by_angle = slope("height"), slope("angle")
     np.testing.assert_allclose(np.linalg.norm(by_height, axis=1), 1, rtol=2e-3)
@@ -174,12 +175,12 @@ def test_the_additive_noise_is_the_true_one_to_first_order(form: RayForm) -> Non
     assert model.noisy is not None
     variances = model.noisy.noise(p, x, u)
     zero, z = jnp.zeros_like(variances), model.observe(p, x, u)
-    np.testing.assert_array_equal(jax.jit(model.noisy.observe)(p, x, zero, u), z)
+    np.testing.assert_array_equal(compiled(model.noisy.observe)(p, x, zero, u), z)
 
     def residual(v: Array) -> Array:
         return model.residual(model.noisy.observe(p, x, v, u), z)  # pyright: ignore
 
-    G = jax.jit(jax.jacfwd(residual))(zero)
+    G = compiled(jax.jacfwd(residual))(zero)
     R = model.observation_noise(p, x, u)
     np.testing.assert_allclose(R, (G * variances[None]) @ G.T, rtol=1e-9, atol=1e-14)
     common = np.asarray(R)[3:6, 3:6]
@@ -203,7 +204,7 @@ def test_with_no_star_in_view_the_filter_uses_the_rest_and_says_how_much() -> No
     given = FilterParams(params(), Gaussian(x, cov))
     z = observations(x.dcm, lost.angle, x.bias)
     for filter in (ckf(HEIGHTS), modified_iterated_ckf(HEIGHTS)):
-        start, update = jax.jit(filter.init)(given), jax.jit(filter.update)
+        start, update = compiled(filter.init)(given), compiled(filter.update)
         none = Obs(jnp.full(9, jnp.nan), jnp.zeros(9, bool))
         kept, info = update(given, start, lost, none)
         assert int(info.flags) == Flag.NO_OBSERVATION

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.weights import Floor, WindowedReset, floor, windowed_reset
 from jaxnav.estimation.filters.adaptive import Adaptation, moved_log_factor, softly_clamped
 from jaxnav.estimation.filters.line_search import Search, step_length
@@ -29,7 +30,7 @@ def test_the_smooth_floor_tends_to_the_hard_one() -> None:
     hard = raised(False, jnp.array(BOUND))
     falling = jnp.array([1.0, 0.6, 0.4, 0.2, 0.1])
     apart = jax.vmap(lambda t: jnp.max(jnp.abs(raised(True, Floor(BOUND, t)) - hard)))
-    gap = jax.jit(apart)(falling)
+    gap = compiled(apart)(falling)
     assert np.all(np.diff(gap) < 0)
     assert gap[-1] < 1e-6
     np.testing.assert_allclose(np.exp(raised(True, Floor(BOUND, 1.0))).sum(), 1, rtol=1e-12)
@@ -37,7 +38,7 @@ def test_the_smooth_floor_tends_to_the_hard_one() -> None:
 
 def test_the_smooth_floor_keeps_out_who_takes_no_part() -> None:
     away = WEIGHTS.at[1].set(-jnp.inf)
-    value, slope = jax.jit(
+    value, slope = compiled(
         jax.value_and_grad(lambda bound: raised(True, Floor(bound), away)[3], argnums=0)
     )(jnp.array(BOUND))
     assert np.isfinite(value)
@@ -52,10 +53,10 @@ def test_the_gradient_of_the_smooth_floor() -> None:
         return raised(True, Floor(params[0], params[1]))[3]
 
     point = np.array([4e-4, 0.5])
-    gradient = jax.jit(jax.grad(weight))(jnp.asarray(point))
-    compiled = jax.jit(weight)
+    gradient = compiled(jax.grad(weight))(jnp.asarray(point))
+    program = compiled(weight)
     expected = [
-        central_difference(compiled, point, e, h)
+        central_difference(program, point, e, h)
         for e, h in zip(np.eye(2), (1e-6, 1e-4), strict=True)
     ]
     np.testing.assert_allclose(gradient, expected, rtol=1e-6)
@@ -78,7 +79,7 @@ def test_the_threshold_of_the_smooth_reset_tends_to_the_hard_one() -> None:
     one = lambda threshold, t: reset(WindowedReset(8.5, threshold, t), True)  # noqa: E731
     over = jax.vmap(jax.vmap(one, (None, 0)), (0, None))
     falling = jnp.array([0.3, 0.1, 0.03, 0.01, 0.003])
-    window, found = jax.jit(over)(jnp.array([0.95, 0.85]), falling)
+    window, found = compiled(over)(jnp.array([0.95, 0.85]), falling)
     w = np.exp(WEIGHTS) / np.exp(WEIGHTS).sum()
     share = (1 - np.exp(window[1, 0]) @ np.exp(WEIGHTS)) / 8.5
     hard = np.stack([w, (1 - share) * w + share / 4])
@@ -95,8 +96,8 @@ def test_the_gradient_of_the_smooth_reset() -> None:
         return reset(WindowedReset(params[2], params[0], params[1]), smooth)[1][0]
 
     point = np.array([0.93, 0.05, 8.5])
-    both = jax.jit(lambda params: jnp.stack([weight(params, smooth) for smooth in (True, False)]))
-    soft, hard = jax.jit(jax.jacrev(both))(jnp.asarray(point))
+    both = compiled(lambda params: jnp.stack([weight(params, smooth) for smooth in (True, False)]))
+    soft, hard = compiled(jax.jacrev(both))(jnp.asarray(point))
     expected = [
         central_difference(both, point, e, h)[0]
         for e, h in zip(np.eye(3), (1e-3, 1e-4, 1e-2), strict=True)
@@ -124,13 +125,13 @@ def test_the_smooth_line_search() -> None:
     """Its temperatures share one program with the hard search, whose is zero."""
     falling = jnp.array([3.0, 0.3, 0.03, 0.01, 0.001, 0.0])
     settings = jnp.stack([jnp.ones(6), jnp.full(6, 0.3), falling], axis=1)
-    value, slope = jax.jit(jax.vmap(lambda a: (stepped(a), jax.jacrev(stepped)(a))))(settings)
+    value, slope = compiled(jax.vmap(lambda a: (stepped(a), jax.jacrev(stepped)(a))))(settings)
     np.testing.assert_array_equal(value[-1], [1.0, 0.5, 0.5, 0.25])
     gap = np.max(np.abs(value[:-1] - value[-1:]), axis=1)
     assert np.all(np.diff(gap) < 0)
     assert gap[-1] < 1e-12
-    compiled = jax.jit(stepped)
-    expected = [central_difference(compiled, np.asarray(settings[1]), e, 1e-3) for e in np.eye(3)]
+    program = compiled(stepped)
+    expected = [central_difference(program, np.asarray(settings[1]), e, 1e-3) for e in np.eye(3)]
     np.testing.assert_allclose(slope[1].T, expected, rtol=1e-6)
     assert np.min(np.abs(slope[1])) > 1e-3
     np.testing.assert_array_equal(slope[-1][:, 1:], 0)
@@ -144,12 +145,12 @@ def test_the_smooth_clamp() -> None:
         return softly_clamped(x, params[0], params[1], params[2])
 
     settings = jnp.stack([jnp.ones(5), jnp.full(5, 2.0), TEMPERATURES], axis=1)
-    value, slope = jax.jit(jax.vmap(lambda a: (clamped(a), jax.jacrev(clamped)(a))))(settings)
+    value, slope = compiled(jax.vmap(lambda a: (clamped(a), jax.jacrev(clamped)(a))))(settings)
     gap = np.max(np.abs(value - jnp.clip(x, 1, 2)[None]), axis=1)
     assert np.all(np.diff(gap) < 0)
     assert gap[-1] < 1e-6
-    compiled = jax.jit(clamped)
-    expected = [central_difference(compiled, np.asarray(settings[1]), e, 1e-3) for e in np.eye(3)]
+    program = compiled(clamped)
+    expected = [central_difference(program, np.asarray(settings[1]), e, 1e-3) for e in np.eye(3)]
     np.testing.assert_allclose(slope[1].T, expected, rtol=1e-6, atol=1e-9)
     assert np.min(np.abs(slope[1])) > 1e-5
     far = softly_clamped(jnp.float32([-1e8, 1e8]), *map(jnp.float32, (0.1, 100, 0.02)))
@@ -173,7 +174,7 @@ def test_the_smooth_bounds_of_the_adaptive_filter() -> None:
 
     over = jax.vmap(jax.vmap(pairs, (None, 0, 0)), (0, None, None))
     cases = jnp.array([20.0, 20.0, 5.0]), jnp.array([0.9, 8.0, 8.0])
-    found = jax.jit(over)(TEMPERATURES, *cases)
+    found = compiled(over)(TEMPERATURES, *cases)
     gap = np.max(np.abs(found[:, :, 0] - found[:, :, 1]), axis=1)
     assert np.all(np.diff(gap) < 0)
     assert gap[-1] < 1e-9
@@ -182,9 +183,9 @@ def test_the_smooth_bounds_of_the_adaptive_filter() -> None:
         return moved(Adaptation(*params), jnp.array([3.6]), smooth)
 
     point = np.array([5.0, 0.5, 2.0, 0.3])
-    compiled = jax.jit(lambda params: factor(params, True))
-    gradient = jax.jit(jax.grad(lambda params: factor(params, True)))(jnp.asarray(point))
-    expected = [central_difference(compiled, point, e, 1e-3) for e in np.eye(4)]
+    program = compiled(lambda params: factor(params, True))
+    gradient = compiled(jax.grad(lambda params: factor(params, True)))(jnp.asarray(point))
+    expected = [central_difference(program, point, e, 1e-3) for e in np.eye(4)]
     np.testing.assert_allclose(gradient, expected, rtol=1e-6)
     assert np.min(np.abs(gradient)) > 1e-4
     silent = jax.grad(lambda params: factor(params, False))(jnp.asarray(point))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.models.sins_cns import (
     LAYOUT,
     SinsCnsParams,
@@ -22,8 +23,8 @@ from jaxnav.units import ARCSEC
 
 RADIUS = 6.371e6
 STEP = 0.01
-mechanise = jax.jit(mechanise_launch_inertial, static_argnames=("step", "every"))
-tilts = jax.jit(jax.vmap(so3_local))
+mechanise = compiled(mechanise_launch_inertial, static_argnames=("step", "every"))
+tilts = compiled(jax.vmap(so3_local))
 
 
 @cache
@@ -57,7 +58,7 @@ def test_perfect_increments_reproduce_the_flight():
 
 def test_velocity_increment_turns_with_the_body():
     dtheta, dvel = np.array([0.01, 0.0, -0.01]), np.array([0.0, 0.0, 0.1])
-    turned = jax.jit(rotation_compensated)(dtheta, dvel)
+    turned = compiled(rotation_compensated)(dtheta, dvel)
     np.testing.assert_allclose(turned, [0.0, -0.5e-3, 0.1], rtol=1e-15, atol=1e-18)
 
 
@@ -135,7 +136,7 @@ def test_errors_of_the_mechanisation_follow_the_error_model():
     )
     small = np.repeat([1e-5, 1e-2, 10.0, 1e-7, 1e-4], 3)
 
-    @jax.jit
+    @compiled
     def errors(truth):
         coarse, fine = modelled_errors(truth, 10), modelled_errors(truth, 5)
         return mechanised_errors(truth, small), coarse, fine

@@ -8,6 +8,7 @@ import numpy as np
 import optax
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, bank, mmae, rewatch
 from jaxnav.estimation.banks.weights import (
     WindowedReset,
@@ -248,7 +249,7 @@ def test_losses_are_those_of_the_records() -> None:
     def means(z: jax.Array, truth: jax.Array) -> dict[str, jax.Array]:
         return step_means(filter, terms, params, inputs, Obs(z, valid), truth, segment=7)
 
-    found = jax.jit(jax.vmap(means))(z, truth)
+    found = compiled(jax.vmap(means))(z, truth)
     estimate, info = jax.vmap(lambda z: run(filter, params, inputs, Obs(z, valid)).record)(z)
     e = np.asarray(estimate.mean - truth)
     nees = np.einsum("rti,rtij,rtj->rt", e, np.linalg.inv(estimate.cov), e)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.metrics import mean_interval
 from jaxnav.estimation.tune.fit import fit, value_and_gradient
 from jaxnav.estimation.tune.transforms import POSITIVE, REAL, Transform, between, coordinates
@@ -36,8 +37,7 @@ recorded = pytest.mark.skipif(
     not DRIVE.is_file(), reason="the recorded drive is not in ../shared/data"
 )
 
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-"""Most of the time is that of the compiler, and the flights are short."""
+pytestmark = pytest.mark.usefixtures("quick_programs")
 
 
 def transforms_of(problem: Problem) -> dict[str, Transform]:
@@ -48,9 +48,8 @@ def check_descent(problem: Problem, runs: int) -> None:
     """The gradient at the hand-set values is right across all coordinates, and leads downhill."""
     free = coordinates(hand_set(problem), transforms_of(problem))
     data = problem.draw(jax.random.key(3), runs)
-    graded = jax.jit(
-        value_and_gradient(lambda point: problem.loss(free.constrain(point), data), problem.mode),
-        compiler_options=QUICK,
+    graded = compiled(
+        value_and_gradient(lambda point: problem.loss(free.constrain(point), data), problem.mode)
     )
     value, gradient = graded(free.start)
     assert np.all(np.asarray(gradient) != 0), "a parameter does nothing"
@@ -209,7 +208,7 @@ def check_slope(problem: Problem) -> None:
     data = problem.draw(jax.random.key(3), 2)
     direction = jnp.where(jnp.arange(free.start.size) % 2, -1.0, 1.0)
 
-    @partial(jax.jit, compiler_options=QUICK)
+    @compiled
     def along(point: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.jvp(
             lambda point: problem.loss(free.constrain(point), data), (point,), (direction,)

@@ -5,6 +5,7 @@ from functools import cache
 import jax
 import numpy as np
 
+from jaxnav.compiling import compiled
 from jaxnav.navigation.earth import metres_per_radian
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import accumulate
@@ -24,7 +25,7 @@ STEEPEST, MOST_BENT = 15 / 8, 10 / np.sqrt(3)
 @cache
 def driven() -> Trajectory:
     """Ten minutes through the town."""
-    drives = jax.jit(lambda: drive(VehicleProfile(LEGS), steps=RATE * LENGTH, step=1 / RATE))
+    drives = compiled(lambda: drive(VehicleProfile(LEGS), steps=RATE * LENGTH, step=1 / RATE))
     return jax.tree.map(np.asarray, drives())
 
 
@@ -85,7 +86,7 @@ def test_increments_reproduce_the_drive_at_one_hertz() -> None:
     """Within half a metre in ten minutes, from the trapezoid of a velocity that accelerates."""
     truth = driven()
 
-    @jax.jit
+    @compiled
     def solved(start: NavState, dtheta: jax.Array, dvel: jax.Array) -> NavState:
         def one(state: NavState, now: tuple[jax.Array, jax.Array]) -> tuple[NavState, NavState]:
             state = level_step(state, *now, 1.0)

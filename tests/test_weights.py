@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.imm import uniform_switching
 from jaxnav.estimation.banks.mixture import mixture_info, moment_match
 from jaxnav.estimation.banks.weights import (
@@ -68,7 +69,7 @@ def weigh(
         return (memory, log_weights, k + 1), log_weights
 
     first = (rule.init(own, start), start, jnp.int32(1))
-    return jax.jit(lambda rows: jax.lax.scan(step, first, rows)[1])(rows)
+    return compiled(lambda rows: jax.lax.scan(step, first, rows)[1])(rows)
 
 
 @each_rule
@@ -147,7 +148,7 @@ def test_gradient_of_a_rules_parameter(name: str) -> None:
     target = jnp.array(rng.normal(size=(60, MODELS)))
     leaves, tree = jax.tree.flatten(RULES[name][1])
 
-    @jax.jit
+    @compiled
     def score(values: jax.Array) -> jax.Array:
         params = tree.unflatten([values[i] for i in range(len(leaves))])
         return jnp.sum(jnp.exp(weigh(name, rows, None, params)) * target)
@@ -226,7 +227,7 @@ def innovations(S: np.ndarray, true: float, seed: int, steps: int = SEEN) -> Inf
     return Info(wide, jnp.array(variance), jnp.array(log_likelihood), jnp.array(nis), flags, flags)
 
 
-@jax.jit
+@compiled
 def penalised(params: Penalty, infos: Info, start: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Counts (T,) and log-weights (T, M) of the penalty rule over infos."""
     rule = penalty()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.banks.mixture import BankParams, panel
 from jaxnav.estimation.banks.weights import bayes, fixed
 from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
@@ -100,10 +101,10 @@ def shared_of(config: ArekfConfig, world: World, factor: float) -> Shared:
     given = world.noise._replace(
         gyro_noise=world.noise.gyro_noise / factor, accel_noise=world.noise.accel_noise / factor
     )
-    kernel = Versoria(np.array(config.versoria_width), np.array(config.versoria_power))
-    adaptation = Adaptation(*(np.array(x) for x in Adaptation(config.iae_memory)))
+    kernel = Versoria(host.array(config.versoria_width), host.array(config.versoria_power))
+    adaptation = Adaptation(*(host.array(x) for x in Adaptation(config.iae_memory)))
     late = config.scenario == "large-heading-error"
-    settle = np.array(config.settle_s if late else 0.0)
+    settle = host.array(config.settle_s if late else 0.0)
     return Shared(world, given, kernel, adaptation, settle)
 
 

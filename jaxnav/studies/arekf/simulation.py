@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.types import Gaussian, Obs
 from jaxnav.navigation.earth import earth_rate, normal_gravity
 from jaxnav.navigation.models.level_errors import SinsLevel
@@ -84,19 +84,19 @@ def noise_of(sensor: Sensor, position: float) -> SinsGnssParams:
         sensor: The grade.
         position: Standard deviation of a GNSS position [m].
     """
-    none = np.zeros(3)
+    none = host.zeros(3)
     return SinsGnssParams(
-        gyro_noise=np.full(3, sensor.arw * DEG_PER_SQRT_HOUR),
-        accel_noise=np.full(3, sensor.vrw / HOUR**0.5),
+        gyro_noise=host.full(3, sensor.arw * DEG_PER_SQRT_HOUR),
+        accel_noise=host.full(3, sensor.vrw / HOUR**0.5),
         gyro_walk=none,
         accel_walk=none,
-        velocity_noise=np.full(3, sensor.velocity),
-        position_noise=np.full(3, position),
+        velocity_noise=host.full(3, sensor.velocity),
+        position_noise=host.full(3, position),
         lever_arm=none,
     )
 
 
-def prior_sigma(config: ArekfConfig, sensor: Sensor) -> np.ndarray:
+def prior_sigma(config: ArekfConfig, sensor: Sensor) -> Array:
     """Return the standard deviations ``(15,)`` at launch with a grade of sensors."""
     east, north, up = config.p0_attitude_deg
     heading = config.heading_deg if config.scenario == "large-heading-error" else up
@@ -106,7 +106,9 @@ def prior_sigma(config: ArekfConfig, sensor: Sensor) -> np.ndarray:
         sensor.drift * DEG_PER_HOUR,
         sensor.bias * 1e3 * MICRO_G,
     )
-    return np.concatenate([np.array([east, north, heading]) * DEG, np.repeat(np.array(others), 3)])
+    return host.concatenate(
+        [host.array([east, north, heading]) * DEG, host.repeat(host.array(others), 3)]
+    )
 
 
 def build_world(config: ArekfConfig) -> World:
@@ -120,8 +122,8 @@ def build_world(config: ArekfConfig) -> World:
         fixes=GnssErrors(
             noise.velocity_noise,
             noise.position_noise,
-            np.array(config.outlier_share if spoiled else 0.0),
-            np.array(config.outlier_scale),
+            host.array(config.outlier_share if spoiled else 0.0),
+            host.array(config.outlier_scale),
         ),
         prior_sigma=prior_sigma(config, config.sensor),
     )

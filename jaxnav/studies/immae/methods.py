@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.banks.mixture import BankParams, PanelState, moment_match, panel
 from jaxnav.estimation.banks.weights import (
     WindowedReset,
@@ -103,29 +103,29 @@ def members_filter(
 
 def panel_params(config: ImmaeConfig) -> BankParams:
     """Return the parameters of the panel: models, single filter and informed filter."""
-    theta = np.array([*config.theta, config.single_theta, 1.0])
+    theta = host.array([*config.theta, config.single_theta, 1.0])
     count = theta.shape[0]
-    initial = Gaussian(np.zeros(15), np.diag(prior_sigma(config) ** 2))
+    initial = Gaussian(host.zeros(15), host.diag(prior_sigma(config) ** 2))
     same = replicate(FilterParams(noise_of(config), initial), count)
     members = Member(
         model=same.model._replace(noise_scale=theta),
         initial=same.initial,
-        told=np.arange(count) == count - 1,
+        told=host.arange(count) == count - 1,
     )
     period = config.reset_period_s / config.filter_period_s
     rules: dict[str, Any] = {
         "kf": (),
         "mmae": (),
-        "immae": ((), WindowedReset(np.array(period), np.array(config.reset_threshold))),
-        "floor": ((), np.array(config.weight_floor)),
-        "markov": (np.array(config.switching), ()),
+        "immae": ((), WindowedReset(host.array(period), host.array(config.reset_threshold))),
+        "floor": ((), host.array(config.weight_floor)),
+        "markov": (host.array(config.switching), ()),
         "oracle": (),
     }
     models = len(config.theta)
-    bank = np.where(np.arange(count) < models, 0.0, -np.inf)
+    bank = host.where(host.arange(count) < models, 0.0, -host.inf)
     alone = {
-        "kf": np.where(np.arange(count) == models, 0.0, -np.inf),
-        "oracle": np.where(np.arange(count) == models + 1, 0.0, -np.inf),
+        "kf": host.where(host.arange(count) == models, 0.0, -host.inf),
+        "oracle": host.where(host.arange(count) == models + 1, 0.0, -host.inf),
     }
     return BankParams(members, rules, {name: alone.get(name, bank) for name in METHODS})
 

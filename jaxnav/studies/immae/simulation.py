@@ -4,10 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from jaxnav.compiling import compiled
+from jaxnav.compiling import compiled, host
 from jaxnav.estimation.run import simulate
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_cns import (
@@ -75,14 +74,14 @@ class Run(NamedTuple):
 def noise_of(config: ImmaeConfig) -> SinsCnsParams:
     """Return the sensors' noise of Table 1, with factor one."""
     return SinsCnsParams(
-        gyro_noise=np.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
-        accel_noise=np.full(3, config.accel_noise_ug * MICRO_G),
-        star_noise=np.full(3, config.star_noise_arcsec * ARCSEC),
-        noise_scale=np.ones(()),
+        gyro_noise=host.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
+        accel_noise=host.full(3, config.accel_noise_ug * MICRO_G),
+        star_noise=host.full(3, config.star_noise_arcsec * ARCSEC),
+        noise_scale=host.ones(()),
     )
 
 
-def prior_sigma(config: ImmaeConfig) -> np.ndarray:
+def prior_sigma(config: ImmaeConfig) -> Array:
     """Return the standard deviations ``(15,)`` of P0.
 
     The paper's list of P0 has fourteen entries, one drift too few, and gives the attitude as
@@ -95,23 +94,23 @@ def prior_sigma(config: ImmaeConfig) -> np.ndarray:
         config.p0_drift_deg_h * DEG_PER_HOUR,
         config.p0_bias_ug * MICRO_G,
     ]
-    return np.repeat(blocks, 3)
+    return host.repeat(blocks, 3)
 
 
-def table_errors(config: ImmaeConfig) -> np.ndarray:
+def table_errors(config: ImmaeConfig) -> Array:
     """Return the initial error state ``(15,)`` of Table 1."""
-    s, error = LAYOUT, np.zeros(15)
-    error[s.phi] = np.array(config.initial_misalignment_arcsec) * ARCSEC
+    s, error = LAYOUT, host.zeros(15)
+    error[s.phi] = host.array(config.initial_misalignment_arcsec) * ARCSEC
     error[s.eps] = config.gyro_drift_deg_h * DEG_PER_HOUR
     error[s.nabla] = config.accel_bias_ug * MICRO_G
     return error
 
 
-def true_scale(config: ImmaeConfig, count: int) -> np.ndarray:
+def true_scale(config: ImmaeConfig, count: int) -> Array:
     """Return the true factor on Q0 for ``count`` equal parts of the flight ``(count,)``."""
-    thrice = 3 * np.arange(count)
+    thrice = 3 * host.arange(count)
     step = config.step_theta if config.scenario == "noise-step" else 1.0
-    return np.where((thrice >= count) & (thrice < 2 * count), step, 1.0)
+    return host.where((thrice >= count) & (thrice < 2 * count), step, 1.0)
 
 
 def build_world(config: ImmaeConfig) -> World:
@@ -127,12 +126,12 @@ def build_world(config: ImmaeConfig) -> World:
         trajectory=trajectory,
         dcm=dcm,
         euler_map=euler_map,
-        sample_scale=np.repeat(scale, every),
+        sample_scale=host.repeat(scale, every),
         step_scale=scale,
         noise=noise_of(config),
         radius=radius,
-        start_mean=np.zeros(15) if drawn else table_errors(config),
-        start_root=np.diag(prior_sigma(config)) if drawn else np.zeros((15, 15)),
+        start_mean=host.zeros(15) if drawn else table_errors(config),
+        start_root=host.diag(prior_sigma(config)) if drawn else host.zeros((15, 15)),
         nominal=nominal,
     )
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.banks.imm import imm, imm_params, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, moment_match, panel
 from jaxnav.estimation.banks.weights import (
@@ -152,20 +153,20 @@ def model_factors(config: MmaeUkfConfig) -> np.ndarray:
 def shared_of(config: MmaeUkfConfig, world: World) -> Shared:
     """Return what all runs share."""
     grid = model_factors(config)
-    nominal = np.ones((1, 2))
+    nominal = host.ones((1, 2))
     models = config.models
     period = config.reset_period_s / config.filter_period_s
-    reset = WindowedReset(np.array(period), np.array(config.reset_threshold))
+    reset = WindowedReset(host.array(period), host.array(config.reset_threshold))
     bank, alone, told = (_prior(models + 2, chosen) for chosen in (range(models), [-2], [-1]))
     return Shared(
         world=world,
         ekf=BankParams(
-            _members(config, world, np.concatenate([grid, nominal])),
+            _members(config, world, host.concatenate([grid, nominal])),
             {"ekf": (), "mmae-ekf": ()},
             {"ekf": alone[:-1], "mmae-ekf": bank[:-1]},
         ),
         ukf=BankParams(
-            _members(config, world, np.concatenate([grid, nominal, nominal]), told=True),
+            _members(config, world, host.concatenate([grid, nominal, nominal]), told=True),
             {"ukf": (), "mmae-ukf": (), "immae-ukf": ((), reset), "oracle": ()},
             {"ukf": alone, "mmae-ukf": bank, "immae-ukf": bank, "oracle": told},
         ),
@@ -173,9 +174,9 @@ def shared_of(config: MmaeUkfConfig, world: World) -> Shared:
     )
 
 
-def _prior(count: int, chosen: Any) -> np.ndarray:
+def _prior(count: int, chosen: Any) -> Array:
     """Return log-weights ``(count,)`` that leave all but the chosen members out."""
-    prior = np.full(count, -np.inf)
+    prior = host.full(count, -host.inf)
     prior[list(chosen)] = 0.0
     return prior
 
@@ -187,13 +188,13 @@ def _members(
     count = factors.shape[0]
     noise = noise_of(config)
     scaled = replicate(noise, count)._replace(
-        gyro_noise=np.array(factors[:, :1]) * noise.gyro_noise[None],
-        accel_noise=np.array(factors[:, 1:]) * noise.accel_noise[None],
+        gyro_noise=host.array(factors[:, :1]) * noise.gyro_noise[None],
+        accel_noise=host.array(factors[:, 1:]) * noise.accel_noise[None],
     )
     # The state that the members start from differs from run to run.
-    anywhere = SinsTotal(np.eye(3), *(np.zeros(3) for _ in range(4)))
-    initial = replicate(Gaussian(anywhere, np.diag(world.prior_sigma**2)), count)
-    last = np.arange(count) == count - 1
+    anywhere = SinsTotal(host.eye(3), *(host.zeros(3) for _ in range(4)))
+    initial = replicate(Gaussian(anywhere, host.diag(world.prior_sigma**2)), count)
+    last = host.arange(count) == count - 1
     return Member(FilterParams(scaled, initial), last & told)
 
 

@@ -4,10 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from jaxnav.compiling import compiled
+from jaxnav.compiling import compiled, host
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import (
@@ -74,21 +73,21 @@ def launch_radius(config: MmaeUkfConfig) -> float:
 def noise_of(config: MmaeUkfConfig) -> SinsTotalParams:
     """Return the nominal noise of the sensors."""
     return SinsTotalParams(
-        gyro_noise=np.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
-        accel_noise=np.full(3, config.accel_noise_ug * MICRO_G),
-        bias_sigma=np.array(config.accel_error_ug * MICRO_G),
-        bias_time=np.array(config.accel_error_time_s),
-        star_noise=np.full(3, config.star_noise_arcsec * ARCSEC),
+        gyro_noise=host.full(3, config.gyro_noise_deg_h * DEG_PER_HOUR),
+        accel_noise=host.full(3, config.accel_noise_ug * MICRO_G),
+        bias_sigma=host.array(config.accel_error_ug * MICRO_G),
+        bias_time=host.array(config.accel_error_time_s),
+        star_noise=host.full(3, config.star_noise_arcsec * ARCSEC),
     )
 
 
-def prior_sigma(config: MmaeUkfConfig) -> np.ndarray:
+def prior_sigma(config: MmaeUkfConfig) -> Array:
     """Return the standard deviations ``(15,)`` of P0."""
     attitude = config.p0_attitude_arcsec * ARCSEC
     if config.scenario == "large-misalignment":
         attitude = config.misalignment_deg * DEG / 3**0.5
-    return np.repeat(
-        np.array(
+    return host.repeat(
+        host.array(
             [
                 attitude,
                 config.p0_velocity,
@@ -101,10 +100,10 @@ def prior_sigma(config: MmaeUkfConfig) -> np.ndarray:
     )
 
 
-def true_scale(config: MmaeUkfConfig) -> np.ndarray:
+def true_scale(config: MmaeUkfConfig) -> Array:
     """Return the true factor on the noise variances at each filter step ``(K,)``."""
-    third = 3 * np.arange(config.steps) // config.steps
-    return np.array(config.schedule)[third] ** 2
+    third = 3 * host.arange(config.steps) // config.steps
+    return host.array(config.schedule)[third] ** 2
 
 
 def build_world(config: MmaeUkfConfig) -> World:
@@ -120,12 +119,12 @@ def build_world(config: MmaeUkfConfig) -> World:
     large = config.scenario == "large-misalignment"
     return World(
         trajectory=trajectory,
-        epochs=jax.tree.map(lambda leaf: np.asarray(leaf)[every::every], trajectory.state),
-        sample_scale=np.repeat(step_scale, every),
+        epochs=jax.tree.map(lambda leaf: host.asarray(leaf)[every::every], trajectory.state),
+        sample_scale=host.repeat(step_scale, every),
         step_scale=step_scale,
         noise=noise_of(config),
         prior_sigma=prior_sigma(config),
-        misalignment=np.array(config.misalignment_deg * DEG if large else 0.0),
+        misalignment=host.array(config.misalignment_deg * DEG if large else 0.0),
     )
 
 

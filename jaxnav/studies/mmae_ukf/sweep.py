@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
@@ -53,7 +54,7 @@ def settling_times(config: MmaeUkfConfig) -> np.ndarray:
         for j, angle in enumerate(ANGLES_DEG):
             sigma = short.prior_sigma.copy()
             sigma[LAYOUT.phi] = angle * DEG / 3**0.5
-            turned = short._replace(prior_sigma=sigma, misalignment=np.array(angle * DEG))
+            turned = short._replace(prior_sigma=sigma, misalignment=host.array(angle * DEG))
             settled = monte_carlo(one, key, config.runs, turned).rows
             times[i, j] = config.filter_period_s * settled.T
     return times

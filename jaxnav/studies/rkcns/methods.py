@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.bounds import linearised_at_truth
 from jaxnav.estimation.filters.iterated import iterated_ckf, modified_iterated_ckf
 from jaxnav.estimation.filters.line_search import Search
@@ -113,11 +114,11 @@ def shared_of(config: RkcnsConfig, world: World) -> Shared:
         star_noise=noise.star_noise,
         refraction_noise=world.refraction_noise,
         density_sigma=world.density_error,
-        disturbance=np.array(0.0),
+        disturbance=host.array(0.0),
         atmosphere=believed_atmosphere(config, world.atmosphere),
     )
-    exact = limb._replace(atmosphere=world.atmosphere, density_sigma=np.array(0.0))
-    return Shared(world, limb, exact, Search(spread=np.array(config.spread)))
+    exact = limb._replace(atmosphere=world.atmosphere, density_sigma=host.array(0.0))
+    return Shared(world, limb, exact, Search(spread=host.array(config.spread)))
 
 
 def believed_atmosphere(config: RkcnsConfig, table: RefractionTable) -> HeightModel:

@@ -5,10 +5,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from jaxnav.compiling import compiled
+from jaxnav.compiling import compiled, host
 from jaxnav.datasets.stars import load_stars
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
@@ -122,21 +121,21 @@ def noise_of(config: RkcnsConfig) -> SinsTotalParams:
     per_sample = config.imu_step**-0.5
     walk = config.random_walk * DEG_PER_SQRT_HOUR * per_sample
     return SinsTotalParams(
-        gyro_noise=np.full(3, walk),
-        accel_noise=np.full(3, config.accel_noise_ug_sqrt_hz * MICRO_G * per_sample),
-        bias_sigma=np.array(config.accel_bias_ug * MICRO_G),
-        bias_time=np.array(np.inf),
-        star_noise=np.full(3, config.star_noise_arcsec * ARCSEC),
+        gyro_noise=host.full(3, walk),
+        accel_noise=host.full(3, config.accel_noise_ug_sqrt_hz * MICRO_G * per_sample),
+        bias_sigma=host.array(config.accel_bias_ug * MICRO_G),
+        bias_time=host.array(host.inf),
+        star_noise=host.full(3, config.star_noise_arcsec * ARCSEC),
     )
 
 
-def prior_sigma(config: RkcnsConfig) -> np.ndarray:
+def prior_sigma(config: RkcnsConfig) -> Array:
     """Return the standard deviations ``(15,)`` at launch."""
-    return np.concatenate(
+    return host.concatenate(
         [
-            np.array(config.p0_attitude_arcsec) * ARCSEC,
-            np.repeat(
-                np.array(
+            host.array(config.p0_attitude_arcsec) * ARCSEC,
+            host.repeat(
+                host.array(
                     [
                         config.p0_velocity,
                         config.p0_position,
@@ -166,10 +165,10 @@ def build_world(config: RkcnsConfig) -> World:
         limb=find_stars(config, atmosphere, epochs),
         atmosphere=atmosphere,
         noise=noise_of(config),
-        refraction_noise=np.array(config.refraction_noise * ARCSEC),
-        density_error=np.array(config.density_error),
+        refraction_noise=host.array(config.refraction_noise * ARCSEC),
+        density_error=host.array(config.density_error),
         prior_sigma=prior_sigma(config),
-        lost=np.array(config.lost),
+        lost=host.array(config.lost),
     )
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.banks.mixture import BankParams, PanelState, panel
 from jaxnav.estimation.banks.weights import Penalty, bayes, chain, fixed, floor, penalty
 from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
@@ -167,7 +168,7 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
         config.decay_least,
     )
     growing = Penalty(config.penalty_scale, config.penalty_exponent)
-    bound = np.array(config.weight_floor)
+    bound = host.array(config.weight_floor)
     rules: dict[str, Any] = dict.fromkeys(names, ()) | {
         "exponential-decay": _arrays(decaying),
         "proposed": _arrays(growing),
@@ -175,7 +176,7 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
         "proposed-bayes-floor": ((), bound),
     }
     log_priors = {
-        name: np.where(np.array([name in member.methods for member in listed]), 0.0, -np.inf)
+        name: host.where(host.array([name in member.methods for member in listed]), 0.0, -host.inf)
         for name in names
     }
     return Shared(
@@ -183,7 +184,7 @@ def shared_of(config: SageHusaConfig, world: World) -> Shared:
         members_of(config),
         rules,
         log_priors,
-        np.array([*config.intervals_s, *WINDOWS_S]),
+        host.array([*config.intervals_s, *WINDOWS_S]),
     )
 
 
@@ -202,24 +203,24 @@ def members_of(config: SageHusaConfig) -> tuple[DriveParams, SageHusa]:
 def _params_of(config: SageHusaConfig, member: _Member) -> DriveParams:
     """Return the model's parameters of a member; in Experiment 1 all of R starts wrong."""
     noise = noise_of(config, member.vrw)
-    horizontal = np.array([1.0, 1.0, 0.0])
+    horizontal = host.array([1.0, 1.0, 0.0])
     wrong = any(name == constant(b) for b in config.forgetting for name in member.methods)
-    grown = np.sqrt(member.r_scale)
+    grown = host.sqrt(member.r_scale)
     position = grown if wrong else 1 + (grown - 1) * horizontal
     own = noise._replace(
-        accel_noise=noise.accel_noise * np.sqrt(member.q_scale),
+        accel_noise=noise.accel_noise * host.sqrt(member.q_scale),
         position_noise=noise.position_noise * position,
         velocity_noise=noise.velocity_noise * (grown if wrong else 1.0),
     )
-    return DriveParams(own, np.array(member.knows))
+    return DriveParams(own, host.array(member.knows))
 
 
 def _arrays(numbers: Any) -> Any:
-    return jax.tree.map(np.asarray, numbers)
+    return jax.tree.map(host.asarray, numbers)
 
 
 def _stacked(trees: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+    return jax.tree.map(lambda *leaves: host.stack(leaves), *trees)
 
 
 @cache

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
+from jaxnav.compiling import host
 from jaxnav.estimation.types import Gaussian, Model, Obs, seeing
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.level_errors import SinsLevel
@@ -98,14 +98,14 @@ def clock_of(config: SageHusaConfig) -> Clock:
 
 def noise_of(config: SageHusaConfig, vrw: float) -> SinsGnssParams:
     """Return the noise of sensors and receiver in SI, with a velocity random walk."""
-    none = np.zeros(3)
+    none = host.zeros(3)
     return SinsGnssParams(
-        gyro_noise=np.full(3, config.arw_deg_sqrt_h * DEG_PER_SQRT_HOUR),
-        accel_noise=np.full(3, vrw),
+        gyro_noise=host.full(3, config.arw_deg_sqrt_h * DEG_PER_SQRT_HOUR),
+        accel_noise=host.full(3, vrw),
         gyro_walk=none,
         accel_walk=none,
-        velocity_noise=np.full(3, config.gnss_velocity),
-        position_noise=np.full(3, config.gnss_position),
+        velocity_noise=host.full(3, config.gnss_velocity),
+        position_noise=host.full(3, config.gnss_position),
         lever_arm=none,
     )
 
@@ -119,21 +119,21 @@ def build_world(config: SageHusaConfig) -> World:
         config.gyro_drift_deg_h * DEG_PER_HOUR,
         config.accel_bias_mg * 1e3 * MICRO_G,
     )
-    attitude = np.array(config.p0_attitude_deg) * DEG
+    attitude = host.array(config.p0_attitude_deg) * DEG
     step, samples = 1 / config.ins_rate_hz, config.steps * config.samples_per_step
     return World(
         trajectory=drive(VehicleProfile(legs), steps=samples, step=step),
         noise=noise_of(config, config.true_vrw),
-        prior_sigma=np.concatenate([attitude, np.repeat(np.array(others), 3)]),
+        prior_sigma=host.concatenate([attitude, host.repeat(host.array(others), 3)]),
         added=added_noise(config),
     )
 
 
-def added_noise(config: SageHusaConfig) -> np.ndarray:
+def added_noise(config: SageHusaConfig) -> Array:
     """Return the standard deviation of the noise added to east and north of each fix ``(T,)``."""
-    time = config.fix_interval_s * np.arange(1, config.steps + 1, dtype=float)
+    time = config.fix_interval_s * host.arange(1, config.steps + 1, dtype=float)
     first, second = (within(time, span) for span in (config.first_noise_s, config.second_noise_s))
-    return np.where(first, config.first_noise, np.where(second, config.second_noise, 0.0))
+    return host.where(first, config.first_noise, host.where(second, config.second_noise, 0.0))
 
 
 def within(time: Array, span: tuple[float, float]) -> Array:
