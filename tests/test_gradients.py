@@ -32,7 +32,8 @@ from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs, replicat
 from jaxnav.navigation.atmosphere import refraction_angle
 from jaxnav.navigation.limb import ray_height, separation
 from jaxnav.navigation.sensors.refraction import raised
-from jaxnav.numerics.linalg import cholesky, safe_sqrt, tria
+from jaxnav.numerics.linalg import cholesky, safe_sqrt
+from jaxnav.numerics.roots import tria
 from jaxnav.numerics.sigma import SigmaRule, unscented
 from tests.cases import Noise, cases
 from tests.oracles.matrices import central_difference

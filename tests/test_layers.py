@@ -12,6 +12,7 @@ ORDER = (
     "units",
     "compiling",
     "numerics.linalg",
+    "numerics.roots",
     "numerics.lie",
     "numerics.se23",
     "numerics.sigma",

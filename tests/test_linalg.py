@@ -6,7 +6,7 @@ import numpy as np
 from jax.test_util import check_grads
 from oracles.matrices import central_difference, random_spd
 
-from jaxnav.numerics import linalg
+from jaxnav.numerics import linalg, roots
 
 SIZES = range(1, 9)
 COUNT = 64
@@ -21,8 +21,8 @@ def kernels(batches):
             "upper": linalg.solve_lower_transposed(L, B),
             "log_det": linalg.log_det(L),
             "matmul": linalg.matmul(S, B),
-            "root": linalg.semidefinite_root(S[:3, :3]).factor,
-            "tria": linalg.tria(jnp.concatenate([L, B], axis=1)),
+            "root": roots.semidefinite_root(S[:3, :3]).factor,
+            "tria": roots.tria(jnp.concatenate([L, B], axis=1)),
         }
 
     return [jax.vmap(one)(*batch) for batch in batches]
@@ -192,9 +192,9 @@ def test_root_of_a_singular_matrix():
     @jax.jit
     def root_and_gradient(A):
         def total(a):
-            return jnp.sum(linalg.semidefinite_root(a).factor)
+            return jnp.sum(roots.semidefinite_root(a).factor)
 
-        return jax.vmap(linalg.semidefinite_root)(A), jax.vmap(jax.grad(total))(A)
+        return jax.vmap(roots.semidefinite_root)(A), jax.vmap(jax.grad(total))(A)
 
     root, gradient = root_and_gradient(A)
     assert np.all(root.semidefinite)
@@ -210,7 +210,7 @@ def test_root_of_a_matrix_that_is_singular_to_rounding():
     rng = np.random.default_rng(6)
     axes = np.linalg.qr(rng.standard_normal((50_000, 3, 3)))[0]
     A = (axes * np.array([1.0, 1.0, 0.0])) @ axes.transpose(0, 2, 1)
-    root = jax.jit(jax.vmap(linalg.semidefinite_root))(A)
+    root = jax.jit(jax.vmap(roots.semidefinite_root))(A)
     assert np.all(root.semidefinite)
     L = np.asarray(root.factor)
     np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-13)
@@ -232,7 +232,7 @@ def test_root_tells_semidefinite_from_indefinite():
         for eigenvalues in (values, negative):
             A = (axes * eigenvalues[:, None]) @ axes.mT
             batches.append(0.5 * (A + A.mT) * units * units.mT)
-    judged = jax.jit(lambda A: [jax.vmap(linalg.semidefinite_root)(a) for a in A])(batches)
+    judged = jax.jit(lambda A: [jax.vmap(roots.semidefinite_root)(a) for a in A])(batches)
     for on_cone, beyond in (judged[:2], judged[2:]):
         assert np.all(on_cone.semidefinite)
         assert not np.any(beyond.semidefinite)
@@ -241,14 +241,14 @@ def test_root_tells_semidefinite_from_indefinite():
 def test_root_of_a_negative_or_missing_variance_is_not_a_number():
     A = np.stack([np.eye(3)] * 4)
     A[1, 1, 1], A[2, 2, 2], A[3, 0, 1], A[3, 1, 0] = -1e-12, np.nan, np.nan, np.nan
-    root = jax.jit(jax.vmap(linalg.semidefinite_root))(A)
+    root = jax.jit(jax.vmap(roots.semidefinite_root))(A)
     np.testing.assert_array_equal(root.semidefinite, [True, False, False, False])
     assert np.all(np.isnan(root.factor[1:3]))
 
 
 @jax.jit
 def downdates(pairs):
-    return [jax.vmap(linalg.downdate)(*pair) for pair in pairs]
+    return [jax.vmap(roots.downdate)(*pair) for pair in pairs]
 
 
 def random_downdates(rng, length):
@@ -306,7 +306,7 @@ def test_derivatives_of_downdate():
 
     @jax.jit
     def total(L, v):
-        return jnp.sum(weight * linalg.downdate(L, v).factor)
+        return jnp.sum(weight * roots.downdate(L, v).factor)
 
     check_grads(jax.vmap(total), (L, v), order=1, modes=["fwd", "rev"], rtol=1e-7, atol=1e-7)
     by_both = jax.jit(jax.vmap(jax.grad(total, argnums=(0, 1))))
