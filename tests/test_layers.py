@@ -24,6 +24,7 @@ ORDER = (
     "estimation.filters.given_noise",
     "estimation.filters.kalman",
     "estimation.filters.square_root",
+    "estimation.filters.cloud",
     "estimation.filters.sigma_point",
     "estimation.filters.line_search",
     "estimation.filters.iterated",

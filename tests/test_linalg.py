@@ -1,12 +1,18 @@
 """Small-matrix kernels against NumPy, and their behaviour where a factorisation fails."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.test_util import check_grads
 from oracles.matrices import central_difference, random_spd
 
+from jaxnav.compiling import accepted_options
 from jaxnav.numerics import linalg, roots
+
+QUICK = accepted_options()
 
 SIZES = range(1, 9)
 COUNT = 64
@@ -314,6 +320,137 @@ def test_derivatives_of_downdate():
     np.testing.assert_allclose(of_L, jnp.tril(weight)[None] + 0 * L, atol=1e-15)
     np.testing.assert_allclose(of_v, 0, atol=1e-15)
     assert all(np.all(np.isfinite(g)) for g in by_both(L, 9 * v))
+
+
+AD_SIZES = (1, 3, 6, 7, 15, 18)
+
+
+def roots_of(n):
+    """Return what factors arrays of ``n`` rows, with arguments and a plain form in NumPy."""
+    rng = np.random.default_rng(n)
+    S = random_spd(rng, 1, n)[0] + np.eye(n)
+    L, wide = np.linalg.cholesky(S), rng.standard_normal((n, n + 9))
+    seen, root = rng.standard_normal((2, n)), np.linalg.cholesky(random_spd(rng, 1, 2)[0])
+    v = L @ np.full(n, 0.5 / np.sqrt(n))
+
+    def square(A):
+        return np.linalg.cholesky(A @ A.T)
+
+    def updated(root, seen, L):
+        return square(np.block([[root, seen], [np.zeros((n, 2)), L]]))
+
+    def symmetric(A):
+        return np.linalg.cholesky(np.tril(A) + np.tril(A, -1).T)
+
+    return {
+        "cholesky": (lambda A: linalg.cholesky(A).factor, symmetric, (S,)),
+        "semidefinite_root": (lambda A: roots.semidefinite_root(A).factor, symmetric, (S,)),
+        "tria": (roots.tria, square, (wide,)),
+        "tria_beside": (roots.tria_beside, lambda L, A: square(np.hstack([L, A])), (L, wide)),
+        "tria_of_update": (roots.tria_of_update, updated, (root, seen, L)),
+        "downdate": (
+            lambda L, v: roots.downdate(L, v).factor,
+            lambda L, v: np.linalg.cholesky(L @ L.T - np.outer(v, v)),
+            (L, v),
+        ),
+    }
+
+
+@pytest.mark.parametrize("n", AD_SIZES)
+def test_derivatives_of_all_factors_in_both_modes(n):
+    """Forward against central differences of NumPy, reverse against forward."""
+    rng = np.random.default_rng(100 + n)
+    cases = roots_of(n)
+    directions = {
+        name: tuple(
+            np.tril(rng.standard_normal(a.shape))
+            if a.ndim == 2 and a.shape[0] == a.shape[1]
+            else rng.standard_normal(a.shape)
+            for a in args
+        )
+        for name, (_, _, args) in cases.items()
+    }
+    weights = {
+        name: rng.standard_normal(plain(*args).shape) for name, (_, plain, args) in cases.items()
+    }
+
+    @partial(jax.jit, compiler_options=QUICK)
+    def both(directions, weights):
+        out = {}
+        for name, (function, _, args) in cases.items():
+            value, forward = jax.jvp(function, args, directions[name])
+            pulled = jax.vjp(function, *args)[1](weights[name])
+            pairs = zip(pulled, directions[name], strict=True)
+            out[name] = value, forward, sum(jnp.sum(a * b) for a, b in pairs)
+        return out
+
+    for name, (value, forward, reverse) in both(directions, weights).items():
+        _, plain, args = cases[name]
+        np.testing.assert_allclose(value, plain(*args), rtol=0, atol=1e-12, err_msg=name)
+        h = 1e-4
+        ahead, behind = (
+            plain(*(a + sign * h * d for a, d in zip(args, directions[name], strict=True)))
+            for sign in (1, -1)
+        )
+        numeric = (ahead - behind) / (2 * h)
+        scale = 1 + np.abs(numeric).max()
+        np.testing.assert_allclose(forward / scale, numeric / scale, atol=1e-6, err_msg=name)
+        expected = np.sum(weights[name] * forward)
+        np.testing.assert_allclose(reverse, expected, rtol=1e-10, atol=1e-10, err_msg=name)
+
+
+def test_arrays_with_zero_rows_and_columns_have_finite_factors_and_derivatives():
+    """A state without variance and noise, a perfect channel, a root of lower rank."""
+    for n in (3, 15):
+        root, seen, L = (jnp.asarray(a) for a in roots_of(n)["tria_of_update"][2])
+        flat, perfect = L.at[:, 1].set(0).at[1].set(0), root.at[:, 0].set(0)
+        calls = (
+            (roots.tria, (jnp.concatenate([flat, flat], axis=1),)),
+            (roots.tria_beside, (flat, flat)),
+            (roots.tria_of_update, (perfect, seen, flat)),
+            (roots.tria_of_update, (0 * root, 0 * seen, 0 * L)),
+        )
+
+        @partial(jax.jit, compiler_options=QUICK)
+        def values_and_gradients(arguments, calls=calls):
+            return [
+                (f(*a), jax.grad(lambda a, f=f: jnp.sum(f(*a)))(a))
+                for (f, _), a in zip(calls, arguments, strict=True)
+            ]
+
+        arrays = (
+            np.hstack([flat, flat]),
+            np.hstack([flat, flat]),
+            np.asarray(roots.update_array(perfect, seen, flat)),
+            np.zeros((n + 2, n + 2)),
+        )
+        found = values_and_gradients([a for _, a in calls])
+        for (factor, gradient), A in zip(found, arrays, strict=True):
+            np.testing.assert_allclose(factor @ factor.T, A @ A.T, rtol=0, atol=1e-12)
+            np.testing.assert_array_equal(factor, np.tril(factor))
+            assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradient))
+
+
+def test_roots_in_float32_stay_there_and_do_not_underflow():
+    """In units of 1e-21 the squares are below the smallest number."""
+    cases = roots_of(15)
+    for name in ("tria", "tria_beside", "tria_of_update"):
+        function, plain, args = cases[name]
+        small = [jnp.asarray(1e-21 * a, jnp.float32) for a in args]
+        factor = jax.jit(function, compiler_options=QUICK)(*small)
+        assert factor.dtype == jnp.float32
+        expected = plain(*args)
+        error = np.abs(np.asarray(factor, float) * 1e21 - expected).max()
+        assert error < 1e-5 * np.abs(expected).max(), name
+
+
+def test_no_factor_is_a_call_into_a_library():
+    cases = roots_of(15)
+    for name, (function, _, args) in cases.items():
+        batch = [jnp.stack([jnp.asarray(a)] * 4) for a in args]
+        text = jax.jit(jax.vmap(function), compiler_options=QUICK).lower(*batch).compile().as_text()
+        assert "custom-call" not in text, name
+        assert "custom_call_target" not in text, name
 
 
 def test_gradient_of_safe_norm_at_zero_and_beyond():

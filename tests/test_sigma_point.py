@@ -32,7 +32,7 @@ def test_rule_has_the_moments_of_a_gaussian(name: str) -> None:
     rng = np.random.default_rng(n)
     P = random_spd(rng, 1, n)[0]
     cloud = drawn(rule, jnp.array(np.linalg.cholesky(P)))
-    offsets = np.asarray(cloud.offsets).T
+    offsets = np.asarray(cloud.offsets)
     scale = rule.weight * np.abs(offsets).max() ** 3
     np.testing.assert_array_equal(cloud.centre, 0)
     np.testing.assert_allclose(rule.weight * offsets.sum(axis=0), 0, atol=1e-12)

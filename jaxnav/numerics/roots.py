@@ -14,7 +14,7 @@ from jax import Array
 from jaxnav.numerics.linalg import UNROLL_LIMIT, eliminated, invertible, solve_lower
 
 BLOCK = 8
-"""Rows that one loop reflects away; a later loop has fewer to carry, each takes its compile time."""
+"""Rows that one loop reflects away; a later one carries fewer, but each takes time to compile."""
 
 
 class SemidefiniteRoot(NamedTuple):

@@ -13,6 +13,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.filters.cloud import (
+    Cloud,
+    centre_column,
+    centred,
+    drawn,
+    drawn_moments,
+    halves_of,
+    moments,
+    once,
+    second_moment,
+    without,
+)
 from jaxnav.estimation.filters.innovation import (
     innovation_info,
     mask_noise,
@@ -38,7 +50,7 @@ from jaxnav.numerics.linalg import (
     solve_lower_transposed,
     symmetrise,
 )
-from jaxnav.numerics.roots import downdate, semidefinite_root, tria_beside, tria_of_update
+from jaxnav.numerics.roots import semidefinite_root, tria_beside, tria_of_update
 from jaxnav.numerics.sigma import SigmaRule, cubature, unscented
 
 RuleOf = Callable[[int], SigmaRule]
@@ -68,35 +80,6 @@ class SquareRootSigmaPointState(NamedTuple):
     indefinite: Array
 
 
-class Cloud(NamedTuple):
-    """Sigma points as tangent vectors at a mean, their weighted mean being zero.
-
-    Attributes:
-        offsets: ``(d, 2 n)`` of the points, one that is opposite to another ``n`` after it.
-        centre: ``(d,)`` of the centre.
-    """
-
-    offsets: Array
-    centre: Array
-
-
-class Halves(NamedTuple):
-    """The :class:`Cloud` of a function at points that lie opposite to each other.
-
-    Of points drawn about their mean the state has an odd half only, so half of the products of
-    moments vanish.
-
-    Attributes:
-        odd: ``(d, n)`` half the difference of opposite points.
-        even: ``(d, n)`` half their sum.
-        centre: ``(d,)`` of the centre.
-    """
-
-    odd: Array
-    even: Array
-    centre: Array
-
-
 def ukf(
     model: Model,
     *,
@@ -113,10 +96,10 @@ def ukf(
         P = sum w_i (e_i - K d_i)(e_i - K d_i)' + K R K'
 
     with ``e_i`` and ``d_i`` the deviations from their means. Sums over opposite points are taken
-    over half their difference and half their sum, of which ``e_i`` has the former alone. Masks and flags are as for the
-    :func:`~jaxnav.estimation.filters.kalman.ekf`. A covariance that is not semi-definite where
-    points are drawn, which a negative centre weight can cause, loses the columns of its negative
-    pivots and raises :attr:`Flag.INDEFINITE`.
+    over half their difference and half their sum, of which ``e_i`` has the former alone.
+    Masks and flags are as for the :func:`~jaxnav.estimation.filters.kalman.ekf`. A covariance that
+    is not semi-definite where points are drawn, which a negative centre weight can cause, loses the
+    columns of its negative pivots and raises :attr:`Flag.INDEFINITE`.
 
     The defaults keep the centre's weight positive for any number of states; ``kappa = 3 - n`` makes
     it negative for n above 3. ``FilterParams.sigma`` overrides the rule, as a leaf that may be
@@ -178,10 +161,10 @@ def square_root_ukf(
         [sqrt(R), sqrt(w) d_i; 0, sqrt(w) e_i] Theta = [sqrt(S), 0; K sqrt(S), L]
 
     Opposite points are turned into half their difference and half their sum first, after which the
-    second array is a triangle beside a few full rows. A negative weight of the centre is taken away afterwards by a downdate; where the difference is
-    not positive definite the centre is left in and :attr:`Flag.INDEFINITE` raised. At a weight of
-    exactly 0 the derivative by it comes out as 0, as its root has none; that of :func:`ukf` is
-    right.
+    second array is a triangle beside a few full rows. A negative weight of the centre is taken away
+    afterwards by a downdate; where the difference is not positive definite the centre is left in
+    and :attr:`Flag.INDEFINITE` raised. At a weight of exactly 0 the derivative by it comes out as
+    0, as its root has none; that of :func:`ukf` is right.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
     ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32; the
@@ -222,7 +205,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         x, cloud = _propagate(model, params, rule, state.x, root.factor, u)
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
-        P = symmetrise(_second_moment(rule, cloud, cloud)) + Q
+        P = symmetrise(second_moment(rule, cloud, cloud)) + Q
         mended = state.indefinite | ~root.semidefinite
         return SigmaPointState(x, P, () if redraw else cloud, mended)
 
@@ -237,8 +220,8 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
             cloud, indefinite = drawn(rule, root.factor), indefinite | ~root.semidefinite
         seen, nu = _observe(model, params, rule, state.x, cloud, u, obs)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
-        moments = _drawn_moments if redraw else _moments
-        S, cross, left = moments(rule, seen, cloud, R)
+        moments_of = drawn_moments if redraw else moments
+        S, cross, left = moments_of(rule, seen, cloud, R)
         factor = cholesky(S)
         gain = solve_lower_transposed(factor.factor, solve_lower(factor.factor, cross))
         gain = jnp.where(obs.valid[:, None] & factor.positive_definite, gain, 0)
@@ -274,11 +257,11 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         x, cloud = _propagate(model, params, rule, state.x, state.L, u)
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
-        centre = _centre_column(rule, cloud.centre)
-        points = rule.weight**0.5 * cloud.offsets
+        centre = centre_column(rule, cloud.centre)
+        points = rule.weight**0.5 * cloud.offsets.T
         noise = semidefinite_root(Q)
         L = tria_beside(noise.factor, jnp.concatenate([points, centre.above], axis=1))
-        L, sound = _without(rule, L, centre.below)
+        L, sound = without(rule, L, centre.below)
         mended = state.indefinite | ~sound | ~noise.semidefinite
         return SquareRootSigmaPointState(x, L, mended)
 
@@ -287,15 +270,15 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
     ) -> tuple[SquareRootSigmaPointState, Info]:
         rule = _rule(params, rule_of, state.L.shape[0])
         seen, nu = _observe(model, params, rule, state.x, drawn(rule, state.L), u, obs)
-        seen = _halves(seen)
+        seen = halves_of(seen)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         root, m = semidefinite_root(R).factor, R.shape[0]
-        centre = _centre_column(rule, seen.centre)
+        centre = centre_column(rule, seen.centre)
         size = (2 * rule.weight) ** 0.5
-        root = tria_beside(root, jnp.concatenate([size * seen.even, centre.above], axis=1))
-        triangle = tria_of_update(root, size * seen.odd, size * rule.spread * state.L)
+        root = tria_beside(root, jnp.concatenate([size * seen.even.T, centre.above], axis=1))
+        triangle = tria_of_update(root, size * seen.odd.T, size * rule.spread * state.L)
         below = jnp.concatenate([centre.below, jnp.zeros((state.L.shape[0], 1), state.L.dtype)])
-        triangle, sound = _without(rule, triangle, below)
+        triangle, sound = without(rule, triangle, below)
         done = read_array(triangle, m, state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         indefinite = state.indefinite | ~sound
@@ -310,12 +293,6 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         return SquareRootSigmaPointState(given.mean, root.factor, ~root.semidefinite)
 
     return Filter(init, predict, update, estimate, restart, model.retract, model.local)
-
-
-def drawn(rule: SigmaRule, L: Array) -> Cloud:
-    """Return the points ``+-spread L_j`` of a factor ``(n, n)`` about their centre."""
-    offsets = rule.spread * L
-    return Cloud(jnp.concatenate([offsets, -offsets], axis=1), jnp.zeros(L.shape[0], L.dtype))
 
 
 def _rule(params: FilterParams, rule_of: RuleOf, n: int) -> SigmaRule:
@@ -339,8 +316,7 @@ def _propagate(
         point = model.transition(params.model, model.retract(x, offset), u)
         return model.local(reference, point)
 
-    differences = jax.vmap(moved, in_axes=1, out_axes=1)(drawn(rule, L).offsets)
-    mean, cloud = _centred(rule, differences)
+    mean, cloud = centred(rule, once(jax.vmap(moved)(drawn(rule, L).offsets)))
     return model.retract(reference, mean), cloud
 
 
@@ -364,75 +340,6 @@ def _observe(
     def residual(offset: Array) -> Array:
         return model.residual(predicted(offset), reference)
 
-    residuals = jax.vmap(residual, in_axes=1, out_axes=1)(cloud.offsets)
-    mean, seen = _centred(rule, jnp.where(obs.valid[:, None], residuals, 0))
+    residuals = jnp.where(obs.valid[None], jax.vmap(residual)(cloud.offsets), 0)
+    mean, seen = centred(rule, once(residuals))
     return seen, nu - mean
-
-
-def _centred(rule: SigmaRule, differences: Array) -> tuple[Array, Cloud]:
-    """Return the mean of points ``(d, 2 n)`` given relative to the centre, and the cloud."""
-    mean = rule.weight * jnp.sum(differences, axis=1)
-    return mean, Cloud(differences - mean[:, None], -mean)
-
-
-def _halves(cloud: Cloud) -> Halves:
-    one, other = jnp.split(cloud.offsets, 2, axis=1)
-    return Halves(0.5 * (one - other), 0.5 * (one + other), cloud.centre)
-
-
-def _second_moment(rule: SigmaRule, a: Cloud, b: Cloud) -> Array:
-    """Return ``sum w_i a_i b_i'``."""
-    centre = rule.centre * (a.centre[:, None] * b.centre[None])
-    return rule.weight * (a.offsets @ b.offsets.T) + centre
-
-
-_Left = Callable[[Array, Array], Array]
-"""What an update leaves of the covariance: ``(gain (m, n), predicted P) -> P``."""
-
-
-def _moments(rule: SigmaRule, seen: Cloud, cloud: Cloud, R: Array) -> tuple[Array, Array, _Left]:
-    """Return ``S``, the cross moment ``(m, n)`` and what is left, for points of any kind."""
-    S = symmetrise(_second_moment(rule, seen, seen)) + R
-    return S, _second_moment(rule, seen, cloud), lambda K, P: P - matmul(K.T, matmul(S, K))
-
-
-def _drawn_moments(
-    rule: SigmaRule, seen: Cloud, cloud: Cloud, R: Array
-) -> tuple[Array, Array, _Left]:
-    """Return the same for points drawn about the mean, in a form that stays semi-definite."""
-    halves, weight = _halves(seen), 2 * rule.weight
-    spread = jnp.split(cloud.offsets, 2, axis=1)[0]
-    centre = rule.centre * (halves.centre[:, None] * halves.centre[None])
-    rest = symmetrise(weight * (halves.even @ halves.even.T) + centre) + R
-    S = symmetrise(weight * (halves.odd @ halves.odd.T)) + rest
-
-    def left(K: Array, P: Array) -> Array:
-        del P
-        kept = spread - matmul(K.T, halves.odd)
-        return weight * (kept @ kept.T) + matmul(K.T, matmul(rest, K))
-
-    return S, weight * (halves.odd @ spread.T), left
-
-
-class _CentreColumn(NamedTuple):
-    """The centre's column ``(d, 1)``: what to add to a root, and what to take away again."""
-
-    above: Array
-    below: Array
-
-
-def _centre_column(rule: SigmaRule, centre: Array) -> _CentreColumn:
-    """Return the column of a root of the second moment that the centre ``(d,)`` gives."""
-    weight = jnp.asarray(rule.centre, centre.dtype)
-    size = jnp.abs(weight)
-    # the root of a zero weight would have no derivative
-    root = jnp.where(size > 0, jnp.sqrt(jnp.where(size > 0, size, 1)), 0)
-    column = (root * centre)[:, None]
-    return _CentreColumn(jnp.where(weight > 0, column, 0), jnp.where(weight < 0, column, 0))
-
-
-def _without(rule: SigmaRule, L: Array, below: Array) -> tuple[Array, Array]:
-    """Take the column of a negative centre from a root; return it and whether that was possible."""
-    if not isinstance(rule.centre, Array) and rule.centre >= 0:
-        return L, jnp.array(True)
-    return downdate(L, below[:, 0])
