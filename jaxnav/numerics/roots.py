@@ -2,7 +2,8 @@
 
 Roots of arrays are found by orthogonal transformations from the right, which never form a product
 of the array with itself; neither do their derivatives. All are written for arrays of a few tens of
-rows, without LAPACK: unrolled up to :data:`~jaxnav.numerics.linalg.UNROLL_LIMIT`, else in loops.
+rows, without LAPACK, as loops over rows: unrolling them gains a tenth of a filter's time and costs
+seconds of compiling.
 """
 
 from typing import NamedTuple
@@ -12,9 +13,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.numerics.linalg import UNROLL_LIMIT, eliminated, invertible, solve_lower
-
-BLOCK = 8
-"""Rows that one loop reflects away; a later one carries fewer, but each takes time to compile."""
 
 
 class SemidefiniteRoot(NamedTuple):
@@ -168,30 +166,21 @@ def _reflected(L: Array, A: Array) -> Array:
     # In units of the largest entry of each row, so that squares do not underflow in float32.
     units = _largest(jnp.concatenate([L, A], axis=1))
     L, A = L / units[:, None], A / units[:, None]
-    columns = []
-    for first in range(0, n, BLOCK):
-        count = min(BLOCK, n - first)
-        index = jnp.arange(n - first)
+    index = jnp.arange(n)
 
-        def reflect(
-            A: Array, given: tuple[Array, Array], index: Array = index
-        ) -> tuple[Array, Array]:
-            i, column = given
-            row = jax.lax.dynamic_index_in_dim(A, i, keepdims=False)
-            pivot = jax.lax.dynamic_index_in_dim(column, i, keepdims=False)
-            along = A @ row
-            squared = jax.lax.dynamic_index_in_dim(along, i, keepdims=False)
-            size = jnp.sqrt(pivot * pivot + squared)
-            safe = jnp.where(size > 0, size, 1)
-            turned = jnp.where(index >= i, (pivot * column + along) / safe, 0)
-            weight = (pivot + size) / jnp.where(squared > 0, squared, 1)
-            return A - ((weight * along - column) / safe)[:, None] * row[None], turned
+    def reflect(A: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
+        i, column = given
+        row = jax.lax.dynamic_index_in_dim(A, i, keepdims=False)
+        pivot = jax.lax.dynamic_index_in_dim(column, i, keepdims=False)
+        along = A @ row
+        squared = jax.lax.dynamic_index_in_dim(along, i, keepdims=False)
+        size = jnp.sqrt(pivot * pivot + squared)
+        safe = jnp.where(size > 0, size, 1)
+        turned = jnp.where(index >= i, (pivot * column + along) / safe, 0)
+        weight = (pivot + size) / jnp.where(squared > 0, squared, 1)
+        return A - ((weight * along - column) / safe)[:, None] * row[None], turned
 
-        given = (index[:count], L[first:, first : first + count].T)
-        A, found = jax.lax.scan(reflect, A, given, unroll=n <= UNROLL_LIMIT)
-        A = A[count:]
-        columns.append(jnp.concatenate([jnp.zeros((count, first), L.dtype), found], axis=1))
-    return jnp.concatenate(columns).T * units[:, None]
+    return jax.lax.scan(reflect, A, (index, L.T))[1].T * units[:, None]
 
 
 def _largest(A: Array) -> Array:
@@ -224,8 +213,7 @@ def downdate(L: Array, v: Array) -> SemidefiniteRoot:
     References:
         Bojanczyk, Brent, van Dooren, de Hoog (1987), SIAM J. Sci. Stat. Comput. 8(3).
     """
-    n = L.shape[0]
-    index = jnp.arange(n)
+    index = jnp.arange(L.shape[0])
 
     def rotate(v: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         j, column = given
@@ -239,6 +227,6 @@ def downdate(L: Array, v: Array) -> SemidefiniteRoot:
         done = jnp.where(index > j, below, jnp.where((index == j) & good, pivot * cosine, 0))
         return cosine * v - sine * below, (good | ((pivot == 0) & (lead == 0)), done)
 
-    rotated = jax.lax.scan(rotate, v, (index, L.T), unroll=n <= UNROLL_LIMIT)[1]
+    rotated = jax.lax.scan(rotate, v, (index, L.T))[1]
     sound = jnp.all(rotated[0])
     return SemidefiniteRoot(jnp.where(sound, rotated[1].T, L), sound)
