@@ -116,8 +116,8 @@ def jax_calls(series: Callable[[Array, Array, Array], Series]) -> Callable[[Dens
     """Return how a user runs a JAX filter over models and runs: ``vmap`` and ``jit``.
 
     Once as it is and once in tiles of runs, XLA being free to use both cores. Splitting the runs
-    over two host devices is no third way: batched LAPACK calls of two devices can wait for each
-    other's threads for ever.
+    over two host devices is no third way: batched LAPACK calls, which these libraries make, of two
+    devices can wait for each other's threads for ever.
     """
 
     def prepare(problem: Dense) -> dict[str, Callable[[], tuple[Any, Any]]]:

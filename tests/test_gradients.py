@@ -32,7 +32,8 @@ from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs, replicat
 from jaxnav.navigation.atmosphere import refraction_angle
 from jaxnav.navigation.limb import ray_height, separation
 from jaxnav.navigation.sensors.refraction import raised
-from jaxnav.numerics.linalg import cholesky, safe_sqrt, tria
+from jaxnav.numerics.linalg import cholesky, safe_sqrt
+from jaxnav.numerics.roots import tria, update_array
 from jaxnav.numerics.sigma import SigmaRule, unscented
 from tests.cases import Noise, cases
 from tests.oracles.matrices import central_difference
@@ -245,18 +246,24 @@ def test_no_decomposition_without_a_derivative_is_on_a_differentiated_path() -> 
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name.startswith("square_root")])
-def test_arrays_given_to_qr_are_tall_and_of_full_rank(
+def test_arrays_that_are_triangularised_are_wide_and_of_full_rank(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With process noise of rank one. The transpose is factored, so what is given is wide."""
+    """With process noise of rank one."""
     given = []
 
-    def recorded(A: Array) -> Array:
-        jax.debug.callback(lambda A: given.append(np.asarray(A)), A)
-        return tria(A)
+    def recorded(array: Callable[..., Array]) -> Callable[..., Array]:
+        def call(*parts: Array) -> Array:
+            A = array(*parts)
+            jax.debug.callback(lambda A: given.append(np.asarray(A)), A)
+            return tria(A)
+
+        return call
 
     for module in (square_root, sigma_point):
-        monkeypatch.setattr(module, "tria", recorded)
+        beside = recorded(lambda *parts: jnp.concatenate(parts, axis=1))
+        monkeypatch.setattr(module, "tria_beside", beside)
+        monkeypatch.setattr(module, "tria_of_update", recorded(update_array))
     filter, params, _ = cases(oscillator(lambda x: x), PARAMS, 1)[name]
 
     @compiled
@@ -266,7 +273,7 @@ def test_arrays_given_to_qr_are_tall_and_of_full_rank(
 
     jax.block_until_ready(step(jnp.ones(1)))
     jax.effects_barrier()
-    assert len(given) == 2
+    assert len(given) == (3 if name in ("square_root_ukf", "square_root_ckf") else 2)
     for A in given:
         assert A.shape[1] >= A.shape[0]
         assert np.linalg.svd(A, compute_uv=False).min() > 1e-3

@@ -1,13 +1,16 @@
 """Small-matrix kernels against NumPy, and their behaviour where a factorisation fails."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.test_util import check_grads
 from oracles.matrices import central_difference, random_spd
 
 from jaxnav.compiling import compiled
-from jaxnav.numerics import linalg
+from jaxnav.numerics import linalg, roots
 
 SIZES = range(1, 9)
 COUNT = 64
@@ -22,8 +25,8 @@ def kernels(batches):
             "upper": linalg.solve_lower_transposed(L, B),
             "log_det": linalg.log_det(L),
             "matmul": linalg.matmul(S, B),
-            "root": linalg.semidefinite_root(S[:3, :3]).factor,
-            "tria": linalg.tria(jnp.concatenate([L, B], axis=1)),
+            "root": roots.semidefinite_root(S[:3, :3]).factor,
+            "tria": roots.tria(jnp.concatenate([L, B], axis=1)),
         }
 
     return [jax.vmap(one)(*batch) for batch in batches]
@@ -193,9 +196,9 @@ def test_root_of_a_singular_matrix():
     @compiled
     def root_and_gradient(A):
         def total(a):
-            return jnp.sum(linalg.semidefinite_root(a).factor)
+            return jnp.sum(roots.semidefinite_root(a).factor)
 
-        return jax.vmap(linalg.semidefinite_root)(A), jax.vmap(jax.grad(total))(A)
+        return jax.vmap(roots.semidefinite_root)(A), jax.vmap(jax.grad(total))(A)
 
     root, gradient = root_and_gradient(A)
     assert np.all(root.semidefinite)
@@ -211,7 +214,7 @@ def test_root_of_a_matrix_that_is_singular_to_rounding():
     rng = np.random.default_rng(6)
     axes = np.linalg.qr(rng.standard_normal((50_000, 3, 3)))[0]
     A = (axes * np.array([1.0, 1.0, 0.0])) @ axes.transpose(0, 2, 1)
-    root = compiled(jax.vmap(linalg.semidefinite_root))(A)
+    root = compiled(jax.vmap(roots.semidefinite_root))(A)
     assert np.all(root.semidefinite)
     L = np.asarray(root.factor)
     np.testing.assert_allclose(L @ L.transpose(0, 2, 1), A, rtol=0, atol=1e-13)
@@ -233,7 +236,7 @@ def test_root_tells_semidefinite_from_indefinite():
         for eigenvalues in (values, negative):
             A = (axes * eigenvalues[:, None]) @ axes.mT
             batches.append(0.5 * (A + A.mT) * units * units.mT)
-    judged = compiled(lambda A: [jax.vmap(linalg.semidefinite_root)(a) for a in A])(batches)
+    judged = compiled(lambda A: [jax.vmap(roots.semidefinite_root)(a) for a in A])(batches)
     for on_cone, beyond in (judged[:2], judged[2:]):
         assert np.all(on_cone.semidefinite)
         assert not np.any(beyond.semidefinite)
@@ -242,14 +245,14 @@ def test_root_tells_semidefinite_from_indefinite():
 def test_root_of_a_negative_or_missing_variance_is_not_a_number():
     A = np.stack([np.eye(3)] * 4)
     A[1, 1, 1], A[2, 2, 2], A[3, 0, 1], A[3, 1, 0] = -1e-12, np.nan, np.nan, np.nan
-    root = compiled(jax.vmap(linalg.semidefinite_root))(A)
+    root = compiled(jax.vmap(roots.semidefinite_root))(A)
     np.testing.assert_array_equal(root.semidefinite, [True, False, False, False])
     assert np.all(np.isnan(root.factor[1:3]))
 
 
 @compiled
 def downdates(pairs):
-    return [jax.vmap(linalg.downdate)(*pair) for pair in pairs]
+    return [jax.vmap(roots.downdate)(*pair) for pair in pairs]
 
 
 def random_downdates(rng, length):
@@ -307,7 +310,7 @@ def test_derivatives_of_downdate():
 
     @compiled
     def total(L, v):
-        return jnp.sum(weight * linalg.downdate(L, v).factor)
+        return jnp.sum(weight * roots.downdate(L, v).factor)
 
     check_grads(jax.vmap(total), (L, v), order=1, modes=["fwd", "rev"], rtol=1e-7, atol=1e-7)
     by_both = compiled(jax.vmap(jax.grad(total, argnums=(0, 1))))
@@ -315,6 +318,138 @@ def test_derivatives_of_downdate():
     np.testing.assert_allclose(of_L, jnp.tril(weight)[None] + 0 * L, atol=1e-15)
     np.testing.assert_allclose(of_v, 0, atol=1e-15)
     assert all(np.all(np.isfinite(g)) for g in by_both(L, 9 * v))
+
+
+AD_SIZES = (1, 3, 6, 7, 15, 18)
+
+
+def roots_of(n):
+    """Return what factors arrays of ``n`` rows, with arguments and a plain form in NumPy."""
+    rng = np.random.default_rng(n)
+    S = random_spd(rng, 1, n)[0] + np.eye(n)
+    L, wide = np.linalg.cholesky(S), rng.standard_normal((n, n + 9))
+    seen, root = rng.standard_normal((2, n)), np.linalg.cholesky(random_spd(rng, 1, 2)[0])
+    v = L @ np.full(n, 0.5 / np.sqrt(n))
+
+    def square(A):
+        return np.linalg.cholesky(A @ A.T)
+
+    def updated(root, seen, L):
+        return square(np.block([[root, seen], [np.zeros((n, 2)), L]]))
+
+    def symmetric(A):
+        return np.linalg.cholesky(np.tril(A) + np.tril(A, -1).T)
+
+    return {
+        "cholesky": (lambda A: linalg.cholesky(A).factor, symmetric, (S,)),
+        "semidefinite_root": (lambda A: roots.semidefinite_root(A).factor, symmetric, (S,)),
+        "tria": (roots.tria, square, (wide,)),
+        "tria_beside": (roots.tria_beside, lambda L, A: square(np.hstack([L, A])), (L, wide)),
+        "tria_of_update": (roots.tria_of_update, updated, (root, seen, L)),
+        "downdate": (
+            lambda L, v: roots.downdate(L, v).factor,
+            lambda L, v: np.linalg.cholesky(L @ L.T - np.outer(v, v)),
+            (L, v),
+        ),
+    }
+
+
+@pytest.mark.parametrize("n", AD_SIZES)
+def test_derivatives_of_all_factors_in_both_modes(n):
+    """Forward against central differences of NumPy, reverse against forward."""
+    rng = np.random.default_rng(100 + n)
+    cases = roots_of(n)
+    directions = {
+        name: tuple(
+            np.tril(rng.standard_normal(a.shape))
+            if a.ndim == 2 and a.shape[0] == a.shape[1]
+            else rng.standard_normal(a.shape)
+            for a in args
+        )
+        for name, (_, _, args) in cases.items()
+    }
+    weights = {
+        name: rng.standard_normal(plain(*args).shape) for name, (_, plain, args) in cases.items()
+    }
+
+    @compiled
+    def both(directions, weights):
+        out = {}
+        for name, (function, _, args) in cases.items():
+            value, forward = jax.jvp(function, args, directions[name])
+            pulled = jax.vjp(function, *args)[1](weights[name])
+            pairs = zip(pulled, directions[name], strict=True)
+            out[name] = value, forward, sum(jnp.sum(a * b) for a, b in pairs)
+        return out
+
+    for name, (value, forward, reverse) in both(directions, weights).items():
+        _, plain, args = cases[name]
+        np.testing.assert_allclose(value, plain(*args), rtol=0, atol=1e-12, err_msg=name)
+        h = 1e-4
+        ahead, behind = (
+            plain(*(a + sign * h * d for a, d in zip(args, directions[name], strict=True)))
+            for sign in (1, -1)
+        )
+        numeric = (ahead - behind) / (2 * h)
+        scale = 1 + np.abs(numeric).max()
+        np.testing.assert_allclose(forward / scale, numeric / scale, atol=1e-6, err_msg=name)
+        expected = np.sum(weights[name] * forward)
+        np.testing.assert_allclose(reverse, expected, rtol=1e-10, atol=1e-10, err_msg=name)
+
+
+def test_arrays_with_zero_rows_and_columns_have_finite_factors_and_derivatives():
+    """A state without variance and noise, a perfect channel, a root of lower rank."""
+    for n in (3, 15):
+        root, seen, L = (jnp.asarray(a) for a in roots_of(n)["tria_of_update"][2])
+        flat, perfect = L.at[:, 1].set(0).at[1].set(0), root.at[:, 0].set(0)
+        calls = (
+            (roots.tria, (jnp.concatenate([flat, flat], axis=1),)),
+            (roots.tria_beside, (flat, flat)),
+            (roots.tria_of_update, (perfect, seen, flat)),
+            (roots.tria_of_update, (0 * root, 0 * seen, 0 * L)),
+        )
+
+        @compiled
+        def values_and_gradients(arguments, calls=calls):
+            return [
+                (f(*a), jax.grad(lambda a, f=f: jnp.sum(f(*a)))(a))
+                for (f, _), a in zip(calls, arguments, strict=True)
+            ]
+
+        arrays = (
+            np.hstack([flat, flat]),
+            np.hstack([flat, flat]),
+            np.asarray(roots.update_array(perfect, seen, flat)),
+            np.zeros((n + 2, n + 2)),
+        )
+        found = values_and_gradients([a for _, a in calls])
+        for (factor, gradient), A in zip(found, arrays, strict=True):
+            np.testing.assert_allclose(factor @ factor.T, A @ A.T, rtol=0, atol=1e-12)
+            np.testing.assert_array_equal(factor, np.tril(factor))
+            assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradient))
+
+
+def test_roots_in_float32_stay_there_and_do_not_underflow():
+    """In units of 1e-21 the squares are below the smallest number."""
+    cases = roots_of(15)
+    for name in ("tria", "tria_beside", "tria_of_update"):
+        function, plain, args = cases[name]
+        small = [jnp.asarray(1e-21 * a, jnp.float32) for a in args]
+        factor = compiled(function)(*small)
+        assert factor.dtype == jnp.float32
+        expected = plain(*args)
+        error = np.abs(np.asarray(factor, float) * 1e21 - expected).max()
+        assert error < 1e-5 * np.abs(expected).max(), name
+
+
+def test_no_factor_is_a_call_into_a_library():
+    cases = roots_of(15)
+    for name, (function, _, args) in cases.items():
+        batch = [jnp.stack([jnp.asarray(a)] * 4) for a in args]
+        text = compiled(jax.vmap(function)).lower(*batch).compile().as_text()
+        assert text is not None
+        assert "custom-call" not in text, name
+        assert "custom_call_target" not in text, name
 
 
 def test_gradient_of_safe_norm_at_zero_and_beyond():

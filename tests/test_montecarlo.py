@@ -12,7 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.compiling import accepted_options
+from jaxnav.estimation.filters.sigma_point import square_root_ckf, square_root_ukf
+from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
+from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.study import run_campaign
 from tests.programs import compilations
@@ -94,6 +98,53 @@ def test_progress_counts_runs() -> None:
     assert seen == [(2, 11), (4, 11), (6, 11), (8, 11), (10, 11), (11, 11)]
 
 
+N = 7
+SQUARE_ROOTS = {
+    build.__name__: build
+    for build in (square_root_kf, square_root_ekf, square_root_ukf, square_root_ckf)
+}
+
+
+def linear_model() -> Model:
+    rng = np.random.default_rng(0)
+    A, H = jnp.array(np.eye(N) + 0.1 * rng.normal(size=(N, N))), jnp.array(rng.normal(size=(3, N)))
+    return Model(
+        transition=lambda p, x, u: 0.9 * A @ x,
+        process_noise=lambda p, x, u: 0.1 * jnp.eye(N),
+        observe=lambda p, x, u: H @ x,
+        observation_noise=lambda p, x, u: jnp.ones(3),
+    )
+
+
+@pytest.mark.parametrize("name", SQUARE_ROOTS)
+def test_square_roots_on_many_threads_never_stall_and_are_bitwise_those_of_one(name: str) -> None:
+    """Batched LAPACK calls shared the threads they were called from, and waited for ever."""
+    filter = SQUARE_ROOTS[name](linear_model())
+    params = FilterParams((), Gaussian(jnp.zeros(N), jnp.eye(N)))
+
+    def step(params: FilterParams, z: jax.Array) -> Any:
+        state = filter.predict(params, filter.init(params), jnp.zeros(()))
+        return filter.update(params, state, jnp.zeros(()), Obs(z, jnp.ones(3, bool)))
+
+    batch = jax.jit(jax.vmap(step, in_axes=(None, 0)), compiler_options=accepted_options())
+    program = batch.lower(params, jnp.zeros((4, 3))).compile().as_text()
+    assert program is not None
+    assert "custom-call" not in program
+    assert "custom_call_target" not in program
+
+    def run_one(key: jax.Array, params: FilterParams) -> RunOutput:
+        state, info = step(params, jax.random.normal(key, (3,)))
+        return RunOutput((filter.estimate(state), info.log_likelihood))
+
+    one, many = (
+        monte_carlo(run_one, jax.random.key(0), 1600, params, tile=4, threads=threads)
+        for threads in (1, 4)
+    )
+    assert one.finite.all()
+    for a, b in zip(jax.tree.leaves(one.rows), jax.tree.leaves(many.rows), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize(
     ("runs", "options", "said"),
     [
@@ -120,7 +171,8 @@ def test_ten_thousand_runs_of_the_linear_chain_hold_in_memory() -> None:
         from pathlib import Path
         import jax
         jax.config.update("jax_enable_x64", True)
-        from jaxnav.studies.immae.config import ImmaeConfig
+        from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs
+from jaxnav.studies.immae.config import ImmaeConfig
         from jaxnav.studies.immae.study import run_campaign
         def peak():
             # getrusage would count what the parent held when it started this process

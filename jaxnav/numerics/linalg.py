@@ -2,12 +2,11 @@
 
 A batched ``dot`` of 3x3 blocks and a LAPACK call per step each cost more than the arithmetic of a
 whole Kalman step, so the sizes a navigation filter meets (three axes, up to six measurements) are
-written out as multiply-adds over Python loops that unroll at trace time. Above that a loop takes a
-matrix apart column by column: batched LAPACK calls share the threads that they are called from, and
-a large batch of them can stall for good (jax 0.10.2 on two cores).
+written out as multiply-adds over Python loops that unroll at trace time. Above that a rolled loop
+takes a matrix column by column, looking back at the columns that are done: unrolled it would take
+seconds to compile. Batched LAPACK calls also share their threads with whoever calls them.
 """
 
-from collections.abc import Callable
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -91,43 +90,95 @@ class Cholesky(NamedTuple):
 def cholesky(S: Array) -> Cholesky:
     """Factor a symmetric matrix ``(m, m)``; a failed factorisation is reported, never NaN.
 
-    Only the lower triangle is read. Non-positive pivots are replaced by one before the root, so a
-    caller can select against a failed factor without poisoning gradients.
+    Only the lower triangle is read. Where a pivot is not positive the factor is the identity, so a
+    caller can select against it without poisoning gradients.
     """
-    m = S.shape[0]
-    if m > UNROLL_LIMIT:
-        return _rolled_cholesky(S)
+    found = eliminated(S).factor
+    sound = jnp.all(jnp.diag(found) > 0)
+    factor = jnp.where(sound, found, jnp.eye(S.shape[0], dtype=S.dtype))
+    ratio = jnp.min(jnp.diag(factor) ** 2 / jnp.where(sound, jnp.diag(S), 1))
+    return Cholesky(factor, sound, jnp.where(sound, ratio, 0))
+
+
+class Elimination(NamedTuple):
+    """A symmetric matrix taken apart.
+
+    Attributes:
+        factor: ``(n, n)`` lower; columns whose pivot is not positive are zero.
+        pivots: ``(n,)`` what was left on the diagonal when its column's turn came. A verdict: it
+            has no derivative.
+    """
+
+    factor: Array
+    pivots: Array
+
+
+@jax.custom_jvp
+def eliminated(S: Array) -> Elimination:
+    """Take a symmetric matrix ``(n, n)`` apart column by column; only the lower half is read.
+
+    The derivative is that of the columns with a positive pivot, the others staying zero, by two
+    substitutions: ``dL = L Phi(inv(L) dS inv(L'))``, ``Phi`` the lower half with half the diagonal.
+    """
+    return _eliminated_unrolled(S) if S.shape[0] <= UNROLL_LIMIT else _eliminated_rolled(S)
+
+
+@eliminated.defjvp
+def _eliminated_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[Elimination, Elimination]:
+    (S,), (dS,) = primals, tangents
+    done = eliminated(S)
+    L, good = invertible(done.factor)
+    half = jnp.tril(dS) - 0.5 * jnp.diag(jnp.diag(dS))
+    inner = solve_lower(L, solve_lower(L, half + half.T).T)
+    inner = jnp.tril(inner) - 0.5 * jnp.diag(jnp.diag(inner))
+    return done, Elimination(L @ jnp.where(good[None], inner, 0), jnp.zeros_like(done.pivots))
+
+
+def invertible(L: Array) -> tuple[Array, Array]:
+    """Return a lower factor ``(n, n)`` with ones for its zero pivots, and which ``(n,)`` were not.
+
+    One that is not finite gives the identity, so that a derivative that nobody asks for is finite.
+    """
+    good = jnp.diag(L) > 0
+    whole = L + jnp.diag(jnp.where(good, 0, 1).astype(L.dtype))
+    return jnp.where(jnp.all(jnp.isfinite(L)), whole, jnp.eye(L.shape[0], dtype=L.dtype)), good
+
+
+def _eliminated_unrolled(S: Array) -> Elimination:
+    zero = jnp.zeros((), S.dtype)
     L: list[list[Array]] = []
-    positive = jnp.array(True)
-    ratio = jnp.ones((), S.dtype)
-    for i in range(m):
+    scales: list[Array] = []
+    pivots: list[Array] = []
+    for i in range(S.shape[0]):
         row: list[Array] = []
         for j in range(i):
-            row.append((S[i, j] - _dot(row[:j], L[j][:j])) / L[j][j])
-        pivot = S[i, i] - _dot(row, row)
-        good = pivot > 0
-        positive = positive & good
-        ratio = jnp.minimum(ratio, jnp.where(good, pivot / jnp.where(good, S[i, i], 1), 0))
-        row.append(jnp.sqrt(jnp.where(good, pivot, 1)))
-        L.append(row)
-    zero = jnp.zeros((), S.dtype)
-    factor = jnp.stack([jnp.stack(row + [zero] * (m - len(row))) for row in L])
-    return Cholesky(jnp.where(positive, factor, jnp.eye(m, dtype=S.dtype)), positive, ratio)
+            row.append((S[i, j] - _dot(row[:j], L[j][:j])) * scales[j])
+        pivots.append(S[i, i] - _dot(row, row))
+        scales.append(_over_root(pivots[i]))
+        L.append([*row, safe_sqrt(pivots[i])])
+    rows = [jnp.stack(row + [zero] * (S.shape[0] - len(row))) for row in L]
+    return Elimination(jnp.stack(rows), jnp.stack(pivots))
 
 
-def _rolled_cholesky(S: Array) -> Cholesky:
-    def eliminate(rest: Array) -> tuple[Array, tuple[Array, Array]]:
-        pivot = rest[0, 0]
-        column = rest[:, 0] / jnp.sqrt(jnp.where(pivot > 0, pivot, 1))
-        return (rest - column[:, None] * column[None])[1:, 1:], (pivot, column)
+def _eliminated_rolled(S: Array) -> Elimination:
+    index = jnp.arange(S.shape[0])
 
-    # A matrix that fails is taken apart again as the identity, whose derivative is finite.
-    one = jnp.eye(S.shape[0], dtype=S.dtype)
-    failed = ~jnp.all(jnp.stack(_by_columns(eliminate, jax.lax.stop_gradient(S))[0]) > 0)
-    sound = jnp.where(failed, one, S)
-    numbers, columns = _by_columns(eliminate, sound)
-    ratio = jnp.min(jnp.stack(numbers) / jnp.diag(sound))
-    return Cholesky(_lower(columns), ~failed, jnp.where(failed, 0, ratio))
+    def eliminate(L: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
+        j, column = given
+        left = column - L @ jax.lax.dynamic_index_in_dim(L, j, keepdims=False)
+        pivot = jax.lax.dynamic_index_in_dim(left, j, keepdims=False)
+        found = jnp.where(index >= j, left * _over_root(pivot), 0)
+        return jax.lax.dynamic_update_index_in_dim(L, found, j, 1), pivot
+
+    return Elimination(*jax.lax.scan(eliminate, jnp.zeros_like(S), (index, S.T)))
+
+
+def _over_root(pivot: Array) -> Array:
+    """Return one over the root of a positive pivot, zero for others."""
+    good = pivot > 0
+    return jnp.where(good, 1 / jnp.sqrt(jnp.where(good, pivot, 1)), 0)
 
 
 def _dot(a: list[Array], b: list[Array]) -> Array | int:
@@ -138,7 +189,7 @@ def solve_lower(L: Array, B: Array) -> Array:
     """Return ``inv(L) B`` by substitution; lower ``L`` ``(m, m)``, ``B`` ``(m, n)`` or ``(m,)``."""
     m = L.shape[0]
     if m > UNROLL_LIMIT:
-        return _rolled_solve(L, B)
+        return _solve_rolled(jnp.tril(L), B, upper=False)
     rows: list[Array] = []
     for i in range(m):
         rows.append((B[i] - sum(L[i, j] * rows[j] for j in range(i))) / L[i, i])
@@ -149,23 +200,30 @@ def solve_lower_transposed(L: Array, B: Array) -> Array:
     """Return ``inv(L') B`` by back substitution; shapes as in :func:`solve_lower`."""
     m = L.shape[0]
     if m > UNROLL_LIMIT:
-        return _rolled_solve(L.T[::-1, ::-1], B[::-1])[::-1]
+        return _solve_rolled(jnp.tril(L).T, B, upper=True)
     rows: dict[int, Array] = {}
     for i in reversed(range(m)):
         rows[i] = (B[i] - sum(L[j, i] * rows[j] for j in range(i + 1, m))) / L[i, i]
     return jnp.stack([rows[i] for i in range(m)])
 
 
-def _rolled_solve(L: Array, B: Array) -> Array:
-    m = L.shape[0]
-    columns = jnp.stack([jnp.pad(L[j:, j], (0, j)) for j in range(m)])
+def _solve_rolled(T: Array, B: Array, upper: bool) -> Array:
+    """Return ``inv(T) B`` for a triangular ``T`` ``(m, m)``; its derivatives are solves too."""
 
-    def eliminate(rest: Array, column: Array) -> tuple[Array, Array]:
-        row = rest[0] / column[0]
-        left = rest - (column[:, None] * row[None] if rest.ndim == 2 else column * row)
-        return jnp.concatenate([left[1:], jnp.zeros_like(left[:1])]), row
+    def substituted(T: Array, B: Array, upper: bool) -> Array:
+        def solve(X: Array, given: tuple[Array, Array, Array, Array]) -> tuple[Array, None]:
+            i, row, pivot, b = given
+            return jax.lax.dynamic_update_index_in_dim(X, (b - row @ X) / pivot, i, 0), None
 
-    return jax.lax.scan(eliminate, B, columns)[1]
+        rows = (jnp.arange(T.shape[0]), T, jnp.diag(T), B)
+        return jax.lax.scan(solve, jnp.zeros_like(B), rows, reverse=upper)[0]
+
+    return jax.lax.custom_linear_solve(
+        lambda X: T @ X,
+        B,
+        solve=lambda _, B: substituted(T, B, upper),
+        transpose_solve=lambda _, B: substituted(T.T, B, not upper),
+    )
 
 
 def log_det(L: Array) -> Array:
@@ -245,126 +303,3 @@ def derived_once(A: Array) -> Array:
 def _derived_once_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     one = jnp.eye(primals[0].shape[0], dtype=bool)
     return primals[0], jnp.sum(jnp.where(one[:, :, None], tangents[0][None], 0), axis=1)
-
-
-def tria(A: Array) -> Array:
-    """Return the lower-triangular ``L`` ``(n, n)`` with ``L L' = A A'`` for wide ``A`` ``(n, k)``.
-
-    The diagonal is non-negative, which makes the factor unique for a full-rank ``A``. Uses QR,
-    whose derivative exists when ``A`` has full row rank and ``k >= n``.
-    """
-    R = jnp.linalg.qr(A.T, mode="r")
-    signs = jnp.where(jnp.diag(R) < 0, -1, 1).astype(A.dtype)
-    return (R * signs[:, None]).T
-
-
-class SemidefiniteRoot(NamedTuple):
-    """Lower factor ``L L' = A`` of a positive semi-definite matrix, with its health.
-
-    Attributes:
-        factor: ``(n, n)`` lower; columns without a positive pivot are zero.
-        semidefinite: Whether no pivot was negative by more than rounding.
-    """
-
-    factor: Array
-    semidefinite: Array
-
-
-def semidefinite_root(A: Array) -> SemidefiniteRoot:
-    """Factor a positive semi-definite matrix ``(n, n)``; one that is not is reported.
-
-    Columns whose pivot is not positive are zero, so covariances with states that carry no noise are
-    factored; the gradient with respect to such a zero pivot is zero. The diagonal is raised by
-    ``2 n`` rounding errors first: without that, a matrix that is singular to rounding loses its
-    digits in the elimination (2e-3 relative at n = 15). A variance that is negative or not a number
-    makes the factor NaN.
-    """
-    n = A.shape[0]
-    diagonal = jnp.diag(A)
-    sound = jnp.all(diagonal >= 0)
-    # A zero variance beside a covariance has no negative pivot: its column would go unseen.
-    null = diagonal == 0
-    coupled = jnp.any((null[:, None] | null[None, :]) & (A != 0))
-    rounding = 2 * n * jnp.finfo(A.dtype).eps
-
-    def eliminate(rest: Array) -> tuple[Array, tuple[Array, Array]]:
-        pivot = rest[0, 0]
-        good = pivot > 0
-        column = rest[:, 0] * jnp.where(good, 1 / jnp.sqrt(jnp.where(good, pivot, 1)), 0)
-        return (rest - column[:, None] * column[None])[1:, 1:], (pivot, column)
-
-    pivots, columns = _by_columns(eliminate, A + rounding * jnp.diag(diagonal))
-    lowest = jnp.min(jnp.stack(pivots) / jnp.where(diagonal > 0, diagonal, 1))
-    factor = jnp.where(sound, _lower(columns), jnp.nan)
-    return SemidefiniteRoot(factor, sound & ~coupled & (lowest >= -8 * rounding))
-
-
-def _by_columns(
-    step: Callable[[Any], tuple[Any, tuple[Array, Array]]], rest: Any
-) -> tuple[list[Array], list[Array]]:
-    """Take a square matrix apart column by column, the pivot always in the corner.
-
-    Reading the pivot there costs no gather. Beyond a few columns a loop is as fast as its unrolled
-    form, and a fraction of the program to compile.
-
-    Args:
-        step: From what is left to what is left after a column, one row and column smaller, with a
-            number about the pivot and the column from the pivot down.
-        rest: What is left at the start; a pytree whose leaves are ``(n, n)`` or ``(n,)``.
-
-    Returns:
-        The numbers and the columns, of lengths n, n - 1, ..., 1.
-    """
-    n = jax.tree.leaves(rest)[0].shape[0]
-    if n <= UNROLL_LIMIT:
-        numbers, columns = [], []
-        for _ in range(n):
-            rest, (number, column) = step(rest)
-            numbers.append(number)
-            columns.append(column)
-        return numbers, columns
-
-    def padded(rest: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
-        rest, found = step(rest)
-        return jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, 1),) * leaf.ndim), rest), found
-
-    numbers, columns = jax.lax.scan(padded, rest, None, length=n)[1]
-    return list(numbers), [columns[j, : n - j] for j in range(n)]
-
-
-def _lower(columns: list[Array]) -> Array:
-    """Return the lower-triangular matrix of columns that start at the diagonal."""
-    n = len(columns)
-    zeros = [jnp.zeros(n - column.shape[0], column.dtype) for column in columns]
-    return jnp.stack([jnp.concatenate(pair) for pair in zip(zeros, columns, strict=True)], axis=1)
-
-
-def downdate(L: Array, v: Array) -> SemidefiniteRoot:
-    """Return the lower factor of ``L L' - v v'``, by hyperbolic rotations in mixed form.
-
-    Where the difference is not positive definite, ``L`` is returned as it is and reported.
-
-    Args:
-        L: Lower factor ``(n, n)`` with a non-negative diagonal.
-        v: ``(n,)``.
-
-    References:
-        Bojanczyk, Brent, van Dooren, de Hoog (1987), SIAM J. Sci. Stat. Comput. 8(3).
-    """
-
-    def rotate(left: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        rest, tail = left
-        pivot, lead = rest[0, 0], tail[0]
-        # Relative to the pivot, so that the square of a small one cannot underflow.
-        sine = jnp.where(pivot > 0, lead / jnp.where(pivot > 0, pivot, 1), 0)
-        squared = (1 - sine) * (1 + sine)
-        good = (squared > 0) & (pivot > 0)
-        cosine, sine = jnp.sqrt(jnp.where(good, squared, 1)), jnp.where(good, sine, 0)
-        column = (rest[1:, 0] - sine * tail[1:]) / cosine
-        tail = cosine * tail[1:] - sine * column
-        whole = jnp.concatenate([jnp.where(good, pivot * cosine, 0)[None], column])
-        return (rest[1:, 1:], tail), (good | ((pivot == 0) & (lead == 0)), whole)
-
-    done, columns = _by_columns(rotate, (L, v))
-    sound = jnp.all(jnp.stack(done))
-    return SemidefiniteRoot(jnp.where(sound, _lower(columns), L), sound)

@@ -42,11 +42,11 @@ from jaxnav.estimation.types import (
 from jaxnav.numerics.linalg import (
     Cholesky,
     cholesky,
-    semidefinite_root,
     solve_lower,
     solve_lower_transposed,
     symmetrise,
 )
+from jaxnav.numerics.roots import semidefinite_root
 
 
 class _Slope(NamedTuple):

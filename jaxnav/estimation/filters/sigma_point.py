@@ -13,6 +13,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.filters.cloud import (
+    Cloud,
+    centre_column,
+    centred,
+    drawn,
+    drawn_moments,
+    halves_of,
+    moments,
+    once,
+    second_moment,
+    without,
+)
 from jaxnav.estimation.filters.innovation import (
     innovation_info,
     mask_noise,
@@ -20,7 +32,7 @@ from jaxnav.estimation.filters.innovation import (
     require_prior,
     require_step,
 )
-from jaxnav.estimation.filters.square_root import read_array, update_array
+from jaxnav.estimation.filters.square_root import read_array
 from jaxnav.estimation.types import (
     Filter,
     FilterParams,
@@ -33,14 +45,12 @@ from jaxnav.estimation.types import (
 )
 from jaxnav.numerics.linalg import (
     cholesky,
-    downdate,
     matmul,
-    semidefinite_root,
     solve_lower,
     solve_lower_transposed,
     symmetrise,
-    tria,
 )
+from jaxnav.numerics.roots import semidefinite_root, tria_beside, tria_of_update
 from jaxnav.numerics.sigma import SigmaRule, cubature, unscented
 
 RuleOf = Callable[[int], SigmaRule]
@@ -70,18 +80,6 @@ class SquareRootSigmaPointState(NamedTuple):
     indefinite: Array
 
 
-class Cloud(NamedTuple):
-    """Sigma points as tangent vectors at a mean, their weighted mean being zero.
-
-    Attributes:
-        offsets: ``(2 n, d)`` of the points.
-        centre: ``(d,)`` of the centre.
-    """
-
-    offsets: Array
-    centre: Array
-
-
 def ukf(
     model: Model,
     *,
@@ -97,10 +95,11 @@ def ukf(
         P- = sum w_i e_i e_i' + Q,   S = sum w_i d_i d_i' + R,   K = sum w_i e_i d_i' inv(S)
         P = sum w_i (e_i - K d_i)(e_i - K d_i)' + K R K'
 
-    with ``e_i`` and ``d_i`` the deviations from their means. Masks and flags are as for the
-    :func:`~jaxnav.estimation.filters.kalman.ekf`. A covariance that is not semi-definite where
-    points are drawn, which a negative centre weight can cause, loses the columns of its negative
-    pivots and raises :attr:`Flag.INDEFINITE`.
+    with ``e_i`` and ``d_i`` the deviations from their means. Sums over opposite points are taken
+    over half their difference and half their sum, of which ``e_i`` has the former alone.
+    Masks and flags are as for the :func:`~jaxnav.estimation.filters.kalman.ekf`. A covariance that
+    is not semi-definite where points are drawn, which a negative centre weight can cause, loses the
+    columns of its negative pivots and raises :attr:`Flag.INDEFINITE`.
 
     The defaults keep the centre's weight positive for any number of states; ``kappa = 3 - n`` makes
     it negative for n above 3. ``FilterParams.sigma`` overrides the rule, as a leaf that may be
@@ -154,18 +153,18 @@ def ckf(model: Model, *, redraw: bool = True) -> Filter:
 def square_root_ukf(
     model: Model, *, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
 ) -> Filter:
-    """Return the unscented filter in array (QR) square-root form; points are always redrawn.
+    """Return the unscented filter in array square-root form; points are always redrawn.
 
     Arguments, parameters and errors are those of :func:`ukf`.
 
-        [sqrt(w) e_i, sqrt(Q)] Theta = [L-, 0]
+        [sqrt(Q), sqrt(w) e_i] Theta = [L-, 0]
         [sqrt(R), sqrt(w) d_i; 0, sqrt(w) e_i] Theta = [sqrt(S), 0; K sqrt(S), L]
 
-    A negative weight of the centre is taken away afterwards by a downdate; where the difference is
-    not positive definite the centre is left in and :attr:`Flag.INDEFINITE` raised. At a weight of
-    exactly 0 the derivative by it comes out as 0, as its root has none; that of :func:`ukf` is
-    right. The caution about several devices of
-    :func:`~jaxnav.estimation.filters.square_root.square_root_kf` holds here too.
+    Opposite points are turned into half their difference and half their sum first, after which the
+    second array is a triangle beside a few full rows. A negative weight of the centre is taken away
+    afterwards by a downdate; where the difference is not positive definite the centre is left in
+    and :attr:`Flag.INDEFINITE` raised. At a weight of exactly 0 the derivative by it comes out as
+    0, as its root has none; that of :func:`ukf` is right.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
     ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32; the
@@ -206,7 +205,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         x, cloud = _propagate(model, params, rule, state.x, root.factor, u)
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
-        P = symmetrise(_second_moment(rule, cloud, cloud)) + Q
+        P = symmetrise(second_moment(rule, cloud, cloud)) + Q
         mended = state.indefinite | ~root.semidefinite
         return SigmaPointState(x, P, () if redraw else cloud, mended)
 
@@ -221,19 +220,13 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
             cloud, indefinite = drawn(rule, root.factor), indefinite | ~root.semidefinite
         seen, nu = _observe(model, params, rule, state.x, cloud, u, obs)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
-        S = symmetrise(_second_moment(rule, seen, seen)) + R
+        moments_of = drawn_moments if redraw else moments
+        S, cross, left = moments_of(rule, seen, cloud, R)
         factor = cholesky(S)
-        cross = _second_moment(rule, seen, cloud)
         gain = solve_lower_transposed(factor.factor, solve_lower(factor.factor, cross))
         gain = jnp.where(obs.valid[:, None] & factor.positive_definite, gain, 0)
         gain = jax.lax.optimization_barrier(gain)
-        if redraw:
-            left = Cloud(
-                cloud.offsets - matmul(seen.offsets, gain), cloud.centre - seen.centre @ gain
-            )
-            P = _second_moment(rule, left, left) + matmul(gain.T, matmul(R, gain))
-        else:
-            P = state.P - matmul(gain.T, matmul(S, gain))
+        P = left(gain, state.P)
         x = model.retract(state.x, matmul(gain.T, nu))
         info = innovation_info(nu, S, factor, obs.valid, indefinite)
         return SigmaPointState(x, symmetrise(P), state.points, jnp.zeros_like(indefinite)), info
@@ -264,10 +257,11 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         x, cloud = _propagate(model, params, rule, state.x, state.L, u)
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
-        points, centre = _weighted(rule, cloud)
+        centre = centre_column(rule, cloud.centre)
+        points = rule.weight**0.5 * cloud.offsets.T
         noise = semidefinite_root(Q)
-        L = tria(jnp.concatenate([points, centre.above, noise.factor], axis=1))
-        L, sound = _without(rule, L, centre)
+        L = tria_beside(noise.factor, jnp.concatenate([points, centre.above], axis=1))
+        L, sound = without(rule, L, centre.below)
         mended = state.indefinite | ~sound | ~noise.semidefinite
         return SquareRootSigmaPointState(x, L, mended)
 
@@ -275,17 +269,16 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         params: FilterParams, state: SquareRootSigmaPointState, u: Input, obs: Obs
     ) -> tuple[SquareRootSigmaPointState, Info]:
         rule = _rule(params, rule_of, state.L.shape[0])
-        cloud = drawn(rule, state.L)
-        seen, nu = _observe(model, params, rule, state.x, cloud, u, obs)
+        seen, nu = _observe(model, params, rule, state.x, drawn(rule, state.L), u, obs)
+        seen = halves_of(seen)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
-        joint = Cloud(
-            jnp.concatenate([seen.offsets, cloud.offsets], axis=1),
-            jnp.concatenate([seen.centre, cloud.centre]),
-        )
-        m = R.shape[0]
-        points, centre = _weighted(rule, joint)
-        columns = jnp.concatenate([points, centre.above], axis=1)
-        triangle, sound = _without(rule, tria(update_array(R, columns[:m], columns[m:])), centre)
+        root, m = semidefinite_root(R).factor, R.shape[0]
+        centre = centre_column(rule, seen.centre)
+        size = (2 * rule.weight) ** 0.5
+        root = tria_beside(root, jnp.concatenate([size * seen.even.T, centre.above], axis=1))
+        triangle = tria_of_update(root, size * seen.odd.T, size * rule.spread * state.L)
+        below = jnp.concatenate([centre.below, jnp.zeros((state.L.shape[0], 1), state.L.dtype)])
+        triangle, sound = without(rule, triangle, below)
         done = read_array(triangle, m, state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         indefinite = state.indefinite | ~sound
@@ -300,12 +293,6 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         return SquareRootSigmaPointState(given.mean, root.factor, ~root.semidefinite)
 
     return Filter(init, predict, update, estimate, restart, model.retract, model.local)
-
-
-def drawn(rule: SigmaRule, L: Array) -> Cloud:
-    """Return the points ``+-spread L_j`` of a factor ``(n, n)`` about their centre."""
-    offsets = rule.spread * L.T
-    return Cloud(jnp.concatenate([offsets, -offsets]), jnp.zeros(L.shape[0], L.dtype))
 
 
 def _rule(params: FilterParams, rule_of: RuleOf, n: int) -> SigmaRule:
@@ -329,7 +316,7 @@ def _propagate(
         point = model.transition(params.model, model.retract(x, offset), u)
         return model.local(reference, point)
 
-    mean, cloud = _centred(rule, jax.vmap(moved)(drawn(rule, L).offsets))
+    mean, cloud = centred(rule, once(jax.vmap(moved)(drawn(rule, L).offsets)))
     return model.retract(reference, mean), cloud
 
 
@@ -349,43 +336,10 @@ def _observe(
 
     reference = predicted(cloud.centre)
     nu = masked_innovation(model, obs, reference)
-    residuals = jax.vmap(lambda offset: model.residual(predicted(offset), reference))(cloud.offsets)
-    mean, seen = _centred(rule, jnp.where(obs.valid[None], residuals, 0))
+
+    def residual(offset: Array) -> Array:
+        return model.residual(predicted(offset), reference)
+
+    residuals = jnp.where(obs.valid[None], jax.vmap(residual)(cloud.offsets), 0)
+    mean, seen = centred(rule, once(residuals))
     return seen, nu - mean
-
-
-def _centred(rule: SigmaRule, differences: Array) -> tuple[Array, Cloud]:
-    """Return the mean of points ``(2 n, d)`` given relative to the centre, and the cloud."""
-    mean = rule.weight * jnp.sum(differences, axis=0)
-    return mean, Cloud(differences - mean[None], -mean)
-
-
-def _second_moment(rule: SigmaRule, a: Cloud, b: Cloud) -> Array:
-    """Return ``sum w_i a_i b_i'``."""
-    centre = rule.centre * (a.centre[:, None] * b.centre[None])
-    return rule.weight * (a.offsets.T @ b.offsets) + centre
-
-
-class _CentreColumn(NamedTuple):
-    """The centre's column ``(d, 1)``: what to add to a root, and what to take away again."""
-
-    above: Array
-    below: Array
-
-
-def _weighted(rule: SigmaRule, cloud: Cloud) -> tuple[Array, _CentreColumn]:
-    """Return the points as columns ``(d, 2 n)`` of a root of their second moment."""
-    weight = jnp.asarray(rule.centre, cloud.centre.dtype)
-    size = jnp.abs(weight)
-    # the root of a zero weight would have no derivative
-    root = jnp.where(size > 0, jnp.sqrt(jnp.where(size > 0, size, 1)), 0)
-    column = (root * cloud.centre)[:, None]
-    above, below = jnp.where(weight > 0, column, 0), jnp.where(weight < 0, column, 0)
-    return rule.weight**0.5 * cloud.offsets.T, _CentreColumn(above, below)
-
-
-def _without(rule: SigmaRule, L: Array, centre: _CentreColumn) -> tuple[Array, Array]:
-    """Take a negative centre away from a root; return it and whether that could be done."""
-    if not isinstance(rule.centre, Array) and rule.centre >= 0:
-        return L, jnp.array(True)
-    return downdate(L, centre.below[:, 0])

@@ -27,7 +27,8 @@ from jaxnav.estimation.types import (
     Obs,
     Point,
 )
-from jaxnav.numerics.linalg import Cholesky, semidefinite_root, solve_lower, tria
+from jaxnav.numerics.linalg import Cholesky, solve_lower
+from jaxnav.numerics.roots import semidefinite_root, tria_beside, tria_of_update
 
 
 class SquareRootState(NamedTuple):
@@ -54,19 +55,15 @@ class ArrayUpdate(NamedTuple):
 
 
 def square_root_kf(model: Model) -> Filter:
-    """Return the Kalman filter of a linear model in array (QR) square-root form.
+    """Return the Kalman filter of a linear model in array square-root form.
 
-        [Phi L, sqrt(Q)] Theta = [L-, 0]
+        [sqrt(Q), Phi L] Theta = [L-, 0]
         [sqrt(R), H L-; 0, L-] Theta = [sqrt(S), 0; K sqrt(S), L]
 
     with ``Theta`` orthogonal. Parameters, offsets and invalid channels are as in
     :func:`~jaxnav.estimation.filters.kalman.kf`, and so are the errors raised. ``P``, ``Q`` and
     ``R`` may be singular; one that is indefinite loses the columns of its negative pivots, without
-    a flag. Gradients need ``[Phi L, sqrt(Q)]`` of full row rank. The two QR factorisations of a
-    step cost far more than the Joseph form does.
-
-    Batched QR of several host devices at once can wait for ever inside XLA: give ``monte_carlo``
-    one device, or set the environment variable ``NPROC`` to 4 or more before JAX starts.
+    a flag. Gradients need ``[sqrt(Q), Phi L]`` of full row rank.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
     ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32; the
@@ -81,8 +78,8 @@ def square_root_kf(model: Model) -> Filter:
 def square_root_ekf(model: Model) -> Filter:
     """Return the extended Kalman filter in the form of :func:`square_root_kf`.
 
-    The maps ``Phi`` and ``H`` are those of :func:`~jaxnav.estimation.filters.kalman.ekf`. Range,
-    rank of the gradients and the caution about several devices are as for the linear filter.
+    The maps ``Phi`` and ``H`` are those of :func:`~jaxnav.estimation.filters.kalman.ekf`. Range
+    and rank of the gradients are as for the linear filter.
     """
 
     def init(params: FilterParams) -> SquareRootState:
@@ -94,7 +91,7 @@ def square_root_ekf(model: Model) -> Filter:
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
         noise = semidefinite_root(Q).factor
-        return SquareRootState(x, tria(jnp.concatenate([push(state.L), noise], axis=1)))
+        return SquareRootState(x, tria_beside(noise, push(state.L)))
 
     def update(
         params: FilterParams, state: SquareRootState, u: Input, obs: Obs
@@ -103,7 +100,8 @@ def square_root_ekf(model: Model) -> Filter:
         nu = masked_innovation(model, obs, z_pred)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         HL = jnp.where(obs.valid[:, None], push(state.L), 0)
-        done = read_array(tria(update_array(R, HL, state.L)), HL.shape[0], state.L)
+        triangle = tria_of_update(semidefinite_root(R).factor, HL, state.L)
+        done = read_array(triangle, HL.shape[0], state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         info = innovation_info(nu, done.S, done.root, obs.valid, rooted=True)
         return SquareRootState(x, done.L), info
@@ -118,20 +116,8 @@ def square_root_ekf(model: Model) -> Filter:
     return Filter(init, predict, update, estimate, restart, model.retract, model.local)
 
 
-def update_array(R: Array, seen: Array, spread: Array) -> Array:
-    """Return ``[sqrt(R), seen; 0, spread]`` ``(m + n, m + k)``, whose triangle is the update.
-
-    Args:
-        R: ``(m, m)`` noise covariance.
-        seen: ``(m, k)`` columns of a root of the predicted observation's covariance.
-        spread: ``(n, k)`` the same columns of a root of the predicted state's covariance.
-    """
-    zero = jnp.zeros((spread.shape[0], R.shape[0]), spread.dtype)
-    return jnp.block([[semidefinite_root(R).factor, seen], [zero, spread]])
-
-
 def read_array(triangle: Array, m: int, predicted: Array) -> ArrayUpdate:
-    """Take the triangle ``(m + n, m + n)`` of :func:`update_array` apart.
+    """Take the triangle ``(m + n, m + n)`` of an update's array apart.
 
     Args:
         triangle: Lower, with a non-negative diagonal.
