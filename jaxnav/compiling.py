@@ -56,14 +56,13 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Call
     return call
 
 
-@cache
-def _top_level() -> Any:
-    return get_opaque_trace_state()
+# Taken on import: the first call may come from within a trace.
+_TOP_LEVEL = get_opaque_trace_state()
 
 
 def _at_top_level() -> bool:
     """Return whether no transformation is being traced."""
-    return get_opaque_trace_state() == _top_level()
+    return get_opaque_trace_state() == _TOP_LEVEL
 
 
 def cores() -> int:
