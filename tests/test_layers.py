@@ -11,7 +11,9 @@ ROOT = Path(jaxnav.__file__).parent
 ORDER = (
     "units",
     "compiling",
+    "numerics.products",
     "numerics.linalg",
+    "numerics.conditioning",
     "numerics.lie",
     "numerics.se23",
     "numerics.sigma",
