@@ -3,7 +3,8 @@
 The negative log-likelihood of the innovations of 16 runs of 12,000 steps, and its derivative with
 respect to the logarithms of the three noise levels: of one Kalman filter and of a bank of five. The
 runs share the covariance, and the scan keeps states at the ends of segments of 110 steps only. The
-derivative is taken in reverse and in forward mode; the goal is judged on the cheaper of the two.
+derivative is taken in reverse and in forward mode; one goal is judged on the cheaper of the two,
+another on reverse mode, whose cost does not grow with the number of parameters.
 """
 
 import sys
@@ -34,6 +35,8 @@ SEGMENT = 110
 CHECK_STEPS = 150
 MODES = ("reverse", "forward")
 GOAL_RATIO = 4.0
+GOAL_REVERSE = 4.5
+"""For many parameters there is no other mode."""
 GOAL_GIB = 3.0
 DIFFERENCE = 1e-4
 """Step of the oracle's central differences; their error is what the gradient's tolerance allows."""
@@ -149,6 +152,10 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             row[f"{row['cheaper']}, ratio"],
             GOAL_RATIO,
         )
+        for row in rows
+    ]
+    goals += [
+        common.Goal(f"ratio, {row['filter']}, reverse mode", row["reverse, ratio"], GOAL_REVERSE)
         for row in rows
     ]
     goals.append(common.Goal("peak memory, GiB", common.peak_gib(), GOAL_GIB))

@@ -1,7 +1,5 @@
 """Small-matrix kernels against NumPy, and their behaviour where a factorisation fails."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np

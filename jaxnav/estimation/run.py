@@ -9,6 +9,7 @@ from jax import Array
 
 from jaxnav.compiling import compiled
 from jaxnav.estimation.types import Filter, Input, Model, Obs, Params
+from jaxnav.numerics.conditioning import KEPT
 
 Recorder = Callable[[Any, Any], Any]
 
@@ -43,8 +44,8 @@ def run(
         every: Keep the record of every so many steps only, from the first such on; ``T`` must be a
             multiple.
         segment: Length of the segments whose inside is computed again by the backward pass, so that
-            a gradient holds ``T / segment + segment`` states instead of ``T``; 0 keeps all. About
-            ``sqrt(T)`` is best.
+            a gradient holds ``T / segment + segment`` states instead of ``T``, at the price of
+            running forward once more; 0 is one segment. About ``sqrt(T)`` holds least.
 
     Returns:
         The trace.
@@ -99,8 +100,13 @@ def scan_in_segments(
 ) -> tuple[Any, Any]:
     """Scan ``step`` over the leading axis of ``xs``, checkpointing segments of a given length.
 
-    The values are those of ``lax.scan``; a remainder shorter than a segment is scanned at the end.
+    A backward pass keeps of each step its start and what is named
+    :data:`~jaxnav.numerics.conditioning.KEPT`, and computes the rest again. The values are those of
+    ``lax.scan``; a remainder shorter than a segment is scanned at the end.
     """
+    # To write down all that a step computes on its way costs more than to compute it again.
+    policy = jax.checkpoint_policies.save_only_these_names(KEPT)
+    step = jax.checkpoint(step, prevent_cse=False, policy=policy)
     length = jax.tree.leaves(xs)[0].shape[0]
     if not 0 < segment < length:
         return jax.lax.scan(step, carry, xs)

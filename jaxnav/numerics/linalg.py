@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-UNROLL_LIMIT = 6
-"""Largest size that is unrolled; above it a product is a ``dot`` and a factorisation a loop."""
+from jaxnav.numerics.products import UNROLL_LIMIT, product
 
 
 def symmetrise(A: Array) -> Array:
@@ -33,14 +32,9 @@ def matmul(A: Array, B: Array) -> Array:
     Returns:
         The product ``(m, n)`` or ``(m,)``.
     """
-    inner = A.shape[1]
-    if inner == 0 or inner > UNROLL_LIMIT:
-        return A @ B
     if B.ndim == 1:
-        return matmul(A, B[:, None])[:, 0]
-    # The derivative of a split is one concatenation; that of slices, padded sums, is far slower.
-    columns, rows = jnp.split(A, inner, axis=1), jnp.split(B, inner, axis=0)
-    return sum((columns[j] * rows[j] for j in range(1, inner)), columns[0] * rows[0])
+        return product(A, B[:, None])[:, 0]
+    return product(A, B)
 
 
 def materialised(tree: Any) -> Any:
@@ -254,52 +248,3 @@ def _solve_positive_jvp(
     (L, S, B), (_, dS, dB) = primals, tangents
     X = solve_positive(L, S, B)
     return X, solve_positive(L, S, dB - matmul(dS, X))
-
-
-@jax.custom_jvp
-def squared_norm(L: Array, S: Array, v: Array) -> Array:
-    """Return ``v' inv(S) v``, ``v`` ``(m,)``; factor and derivative as :func:`solve_positive`."""
-    del S
-    white = solve_lower(L, v)
-    return jnp.sum(white * white)
-
-
-@squared_norm.defjvp
-def _squared_norm_jvp(
-    primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
-) -> tuple[Array, Array]:
-    (L, S, v), (_, dS, dv) = primals, tangents
-    x = solve_positive(L, S, v)
-    return squared_norm(L, S, v), jnp.sum(x * (2 * dv - matmul(dS, x)))
-
-
-@jax.custom_jvp
-def log_det_positive(L: Array, S: Array) -> Array:
-    """Return ``log|S|``; factor and derivative as :func:`solve_positive`."""
-    del S
-    return log_det(L)
-
-
-@log_det_positive.defjvp
-def _log_det_positive_jvp(
-    primals: tuple[Array, Array], tangents: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    L, S = primals
-    inverse = solve_positive(L, S, jnp.eye(L.shape[0], dtype=L.dtype))
-    return log_det(L), jnp.sum(inverse * tangents[1])
-
-
-@jax.custom_jvp
-def derived_once(A: Array) -> Array:
-    """Return ``A`` ``(m, n)`` as it is; its derivative is computed once wherever it is used.
-
-    XLA on CPUs would fuse it into every loop that reads it (see :func:`materialised`); a sum, over
-    one entry each and zeros, it does not. For matrices of few rows.
-    """
-    return A
-
-
-@derived_once.defjvp
-def _derived_once_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    one = jnp.eye(primals[0].shape[0], dtype=bool)
-    return primals[0], jnp.sum(jnp.where(one[:, :, None], tangents[0][None], 0), axis=1)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.types import Flag, Gaussian, Info, Model, Obs
-from jaxnav.numerics.linalg import Cholesky, log_det, log_det_positive, solve_lower, squared_norm
+from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
+from jaxnav.numerics.linalg import Cholesky, log_det, solve_lower
 
 ILL_CONDITIONED_EPS = 1e3
 """Multiple of the machine epsilon below which a Cholesky pivot is called ill-conditioned."""
@@ -99,6 +100,7 @@ def innovation_info(
     indefinite: Array | None = None,
     *,
     rooted: bool = False,
+    solution: Solved | None = None,
 ) -> Info:
     """Judge an innovation ``(m,)`` against its covariance ``(m, m)`` and its factor, all masked.
 
@@ -110,14 +112,18 @@ def innovation_info(
         indefinite: Whether a covariance had to be mended in this step.
         rooted: Whether the factor was computed and ``S`` is its square, which has half the digits:
             the derivative is then taken through the factor, else through ``S`` at less cost.
+        solution: What :func:`~jaxnav.numerics.conditioning.solved` gave, where it is at hand.
     """
-    usable = root.positive_definite
     if rooted:
         whitened = solve_lower(root.factor, nu)
-        squared, volume = jnp.sum(whitened * whitened), log_det(root.factor)
+        distance, volume = jnp.sum(whitened * whitened), log_det(root.factor)
     else:
-        squared, volume = squared_norm(root.factor, S, nu), log_det_positive(root.factor, S)
-    nis = jnp.where(usable, squared, 0)
+        known = solved(S, root, nu) if solution is None else solution
+        root = known.root
+        distance = squared(S, nu, root.factor, known.weighed)
+        volume = log_volume(S, root.factor, known.inverse)
+    usable = root.positive_definite
+    nis = jnp.where(usable, distance, 0)
     channels = jnp.sum(valid).astype(S.dtype)
     log_likelihood = -0.5 * (nis + volume + channels * math.log(2 * math.pi))
     few_digits = root.reciprocal_pivot < ILL_CONDITIONED_EPS * jnp.finfo(S.dtype).eps

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.ad_checkpoint import checkpoint_name
 
 from jaxnav.estimation.filters.innovation import (
     innovation_info,
@@ -34,9 +35,9 @@ from jaxnav.estimation.types import (
     Obs,
     Point,
 )
+from jaxnav.numerics.conditioning import KEPT, corrected, explained, solved
 from jaxnav.numerics.linalg import (
     cholesky,
-    derived_once,
     matmul,
     solve_positive,
     symmetrise,
@@ -119,19 +120,21 @@ def ekf(model: Model) -> Filter:
         z_pred, push = observation_map(model, params.model, state.x, u, n)
         nu = masked_innovation(model, obs, z_pred)
         R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
-        HP = derived_once(push(state.P))
+        HP = push(state.P)
         S = jnp.where(obs.valid[:, None] & obs.valid[None], push(HP.T), 0) + R
-        root = cholesky(S)
+        solution = solved(S, cholesky(S), nu)
+        root = solution.root
         # S does not couple valid channels with invalid ones: a zero here is a zero in the gain.
         heard = jnp.where(obs.valid[:, None] & root.positive_definite, HP, 0)
-        gain = solve_positive(root.factor, S, heard)
+        gain = checkpoint_name(solve_positive(root.factor, S, heard), KEPT)
         HA = push(state.P - matmul(HP.T, gain))
         # What the Joseph form adds is zero but for rounding, whatever the parameters are, and so is
         # its derivative.
         joseph = matmul((matmul(R, gain) - HA).T, gain)
-        P = state.P - matmul(gain.T, HP) + jax.lax.stop_gradient(joseph)
-        x = model.retract(state.x, matmul(gain.T, nu))
-        return KalmanState(x, P), innovation_info(nu, S, root, obs.valid)
+        P = state.P - explained(S, heard, gain) + jax.lax.stop_gradient(joseph)
+        x = model.retract(state.x, corrected(S, heard, nu, gain, solution.weighed))
+        info = innovation_info(nu, S, root, obs.valid, solution=solution)
+        return KalmanState(x, P), info
 
     def estimate(state: KalmanState) -> Gaussian:
         return Gaussian(state.x, symmetrise(state.P))
