@@ -133,12 +133,13 @@ def report(
 ) -> dict[str, Any]:
     """Print the table, the goals beside their figures and the notes; write the JSON if asked."""
     console = Console()
-    table = Table(title=title)
-    for column in rows[0]:
-        table.add_column(column, justify="left" if isinstance(rows[0][column], str) else "right")
-    for row in rows:
-        table.add_row(*(_cell(value) for value in row.values()))
-    console.print(table)
+    if rows:
+        table = Table(title=title)
+        for column, value in rows[0].items():
+            table.add_column(column, justify="left" if isinstance(value, str) else "right")
+        for row in rows:
+            table.add_row(*(_cell(value) for value in row.values()))
+        console.print(table)
     for goal in goals:
         sign = ">=" if goal.at_least else "<="
         word = {True: "met", False: "NOT met", None: "not measured"}[goal.met]

@@ -27,7 +27,7 @@ def print_doctor() -> None:
     if kept and jax.config.values["jax_enable_compilation_cache"]:
         count, size = program_cache.size(Path(kept))
         table.add_row("compiled programs", str(kept))
-        limit = f"at most {program_cache.LIMIT_BYTES / 2**20:.0f} MiB over all versions"
+        limit = f"at most {program_cache.LIMIT_BYTES / 2**20:.0f} MiB"
         table.add_row("", f"{count} of them, {size / 2**20:.1f} MiB; {limit}")
     else:
         table.add_row("compiled programs", "not kept")

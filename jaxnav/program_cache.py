@@ -1,14 +1,16 @@
 """The compiled programs that are kept between processes: where, how many, and what spoils them.
 
 JAX keeps programs in a folder if it is given one, by default only those that took a second to
-compile and without a bound. A study has a hundred that take less, so that a second run would wait
-as long as the first: here all are kept, in a folder of their own for each jax, jaxlib and kind of
-processor, and the oldest go when the whole takes more than :data:`LIMIT_BYTES`.
+compile, without a bound, and without a lock against a process beside it. A study has many that take
+less: here all are kept, in a folder of their own for each jax, jaxlib and kind of processor. JAX
+holds that folder within :data:`LIMIT_BYTES`, under a lock; folders of other versions go, those
+longest without use first, while all together take more than :data:`TOTAL_BYTES`.
 """
 
 import hashlib
 import os
 import platform
+import shutil
 import sys
 import tempfile
 import warnings
@@ -16,8 +18,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-LIMIT_BYTES = 512 * 2**20
-"""What the programs may take on disk, those of all versions together."""
+LIMIT_BYTES = 256 * 2**20
+"""What the programs of one version and processor may take on disk."""
+TOTAL_BYTES = 2 * LIMIT_BYTES
+"""What those of all together may take."""
 _SPOILED = "Error reading persistent compilation cache entry for"
 
 
@@ -43,14 +47,11 @@ def _processor() -> str:
     return hashlib.sha256(told.encode()).hexdigest()[:8]
 
 
-def prepared(limit_bytes: int = LIMIT_BYTES) -> Path | None:
+def prepared() -> Path | None:
     """Return the folder for JAX to keep programs in, which it was told of or :func:`folder`.
 
     A folder that cannot be written is warned of on standard error, and programs are then compiled
     anew. From here on, an entry that cannot be read is told of, removed and compiled anew.
-
-    Args:
-        limit_bytes: Older programs are removed until the rest takes no more than this.
 
     Returns:
         The folder, or ``None`` if there is none to write to.
@@ -62,7 +63,7 @@ def prepared(limit_bytes: int = LIMIT_BYTES) -> Path | None:
         with tempfile.NamedTemporaryFile(dir=chosen):
             pass
         if not given:
-            prune(limit_bytes)
+            prune(TOTAL_BYTES, chosen)
     except OSError as error:
         _tell(f"compiled programs cannot be kept in {chosen} ({error.strerror}), so each")
         return None
@@ -72,23 +73,24 @@ def prepared(limit_bytes: int = LIMIT_BYTES) -> Path | None:
 
 def size(top: Path) -> tuple[int, int]:
     """Return the number of programs below a folder and what they take [bytes]."""
-    sizes = [path.stat().st_size for path in _entries(top)]
+    sizes = [path.stat().st_size for path in top.glob("**/*-cache")]
     return len(sizes), sum(sizes)
 
 
-def _entries(top: Path) -> list[Path]:
-    return list(top.glob("**/*-cache"))
+def prune(limit_bytes: int, kept: Path) -> None:
+    """Remove folders, that longest without use first, until all take no more than the limit.
 
-
-def prune(limit_bytes: int) -> None:
-    """Remove the programs that were used longest ago until the rest is within the limit."""
-    found = [(path, path.stat()) for path in _entries(root())]
-    total = sum(stat.st_size for _, stat in found)
-    for path, stat in sorted(found, key=lambda each: max(each[1].st_atime, each[1].st_mtime)):
+    Args:
+        limit_bytes: The limit.
+        kept: The folder that stays whatever it takes.
+    """
+    others = [path for path in root().iterdir() if path.is_dir() and path != kept]
+    total = size(root())[1]
+    for path in sorted(others, key=lambda path: path.stat().st_mtime):
         if total <= limit_bytes:
             return
-        path.unlink(missing_ok=True)
-        total -= stat.st_size
+        total -= size(path)[1]
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _remove_spoiled_entries(chosen: Path) -> None:

@@ -68,18 +68,19 @@ def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path: Path) -> None:
     assert told.count("\n") == 1
 
 
-def test_the_programs_used_longest_ago_go_first(
+def test_folders_of_other_versions_go_before_this_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    other = tmp_path / "jaxnav" / "xla" / "jax-0.1-of-long-ago"
-    for age, folder in enumerate((program_cache.folder(), program_cache.folder(), other)):
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"jit_f{age}-cache"
-        path.write_bytes(bytes(100))
-        os.utime(path, (1e9 - age, 1e9 - age))
-    program_cache.prune(250)
-    assert [path.name for path in entries(tmp_path)] == ["jit_f0-cache", "jit_f1-cache"]
+    names = ("this", "older", "oldest")
+    for age, name in enumerate(names):
+        folder = program_cache.root() / name
+        folder.mkdir(parents=True)
+        (folder / "jit_f-cache").write_bytes(bytes(100))
+        os.utime(folder, (1e9 - age, 1e9 - age))
+    this = program_cache.root() / "this"
+    program_cache.prune(250, this)
+    assert [path.parent.name for path in entries(tmp_path)] == ["older", "this"]
     assert program_cache.size(program_cache.root()) == (2, 200)
-    program_cache.prune(0)
-    assert entries(tmp_path) == []
+    program_cache.prune(0, this)
+    assert [path.parent.name for path in entries(tmp_path)] == ["this"]
