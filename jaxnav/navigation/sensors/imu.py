@@ -42,10 +42,13 @@ def corrupt(
     Returns:
         The measured increments, ``(N, 3)`` each.
     """
-    gyro_key, accel_key = jax.random.split(key)
     sigma = jnp.sqrt(variance_scale)[:, None]
-    gyro = jax.random.normal(gyro_key, dtheta.shape, dtheta.dtype)
-    accel = jax.random.normal(accel_key, dvel.shape, dvel.dtype)
+
+    def white(key: Array) -> Array:
+        return jax.random.normal(key, dtheta.shape, dtheta.dtype)
+
+    # A generator is a second of compiling: in a loop over both sensors there is one.
+    gyro, accel = jax.lax.map(white, jax.random.split(key))
     bias = jnp.broadcast_to(errors.accel_bias, dvel.shape)
     return (
         dtheta + step * (errors.gyro_drift[None] + sigma * gyro * errors.gyro_noise[None]),
