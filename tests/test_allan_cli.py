@@ -30,7 +30,7 @@ HEADER = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s]," + (
 @pytest.fixture(autouse=True)
 def _leave_jax_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The suite has set JAX up; a process may do so only once."""
-    monkeypatch.setattr(cli, "configure_jax", lambda: None)
+    monkeypatch.setattr(cli, "configure_jax", lambda **options: None)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ TINY = ("--chain", "linear", "--runs", "2", "--duration-s", "6")
 @pytest.fixture(autouse=True)
 def _leave_jax_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The suite has set JAX up; a process may do so only once."""
-    monkeypatch.setattr(cli, "configure_jax", lambda: None)
+    monkeypatch.setattr(cli, "configure_jax", lambda **options: None)
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

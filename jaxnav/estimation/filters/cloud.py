@@ -89,11 +89,21 @@ def moments(rule: SigmaRule, seen: Cloud, cloud: Cloud, R: Array) -> tuple[Array
 def drawn_moments(
     rule: SigmaRule, seen: Cloud, cloud: Cloud, R: Array
 ) -> tuple[Array, Array, Left]:
-    """Return the same for points drawn about the mean, in a form that stays semi-definite."""
+    """Return the same for points drawn about the mean, in a form that stays semi-definite.
+
+    The even halves are taken about their own average, which leaves of a large negative weight of
+    the centre what does not cancel: with ``m`` the mean and ``v = 2 n w``,
+
+        2 w sum (e_i - m)(e_i - m)' + c m m'
+            = 2 w sum (e_i - m / v)(e_i - m / v)' + (c + v - 2 + 1 / v) m m'
+    """
     halves, weight = halves_of(seen), 2 * rule.weight
     spread = jnp.split(cloud.offsets, 2)[0]
-    centre = rule.centre * (halves.centre[:, None] * halves.centre[None])
-    rest = symmetrise(weight * (halves.even.T @ halves.even) + centre) + R
+    even = halves.even - jnp.mean(halves.even, axis=0)[None]
+    total = weight * even.shape[0]
+    centre = rule.centre + total - 2 + 1 / total
+    apart = centre * (halves.centre[:, None] * halves.centre[None])
+    rest = symmetrise(weight * (even.T @ even) + apart) + R
     S = symmetrise(weight * (halves.odd.T @ halves.odd)) + rest
 
     def left(K: Array, P: Array) -> Array:
