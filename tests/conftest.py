@@ -37,10 +37,16 @@ def quick_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiling, "OPTIONS", compiling.OPTIONS | QUICK)
 
 
+@pytest.fixture
+def optimised_programs() -> None:
+    """Asked for by tests of what rounding does, which the optimiser has a part in."""
+
+
 @pytest.fixture(autouse=True)
 def all_but_slow_tests_compile_quickly(request: pytest.FixtureRequest) -> None:
     """Slow tests that compile more than they run ask for it themselves."""
-    if request.node.get_closest_marker("slow") is None:
+    slow = request.node.get_closest_marker("slow") is not None
+    if not slow and "optimised_programs" not in request.fixturenames:
         request.getfixturevalue("quick_programs")
 
 

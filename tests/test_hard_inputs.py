@@ -446,6 +446,7 @@ def fifteen_states(build: Callable[[Model], Filter], dtype: jnp.dtype) -> tuple[
     return covs, least, flags
 
 
+@pytest.mark.usefixtures("optimised_programs")
 def test_rules_of_large_weights_stay_positive_or_say_so() -> None:
     """In float32 with 15 states: what a covariance loses in an update shows in the next draw.
 
