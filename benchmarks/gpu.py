@@ -149,6 +149,12 @@ def dynamax_linear(problem: Nonlinear) -> Callable[[Array], Array]:
     return lambda z: jnp.asarray(inference.lgssm_filter(params, z).marginal_loglik)
 
 
+def dynamax_nonlinear(contest: Contest, problem: Nonlinear) -> Callable[[Array], Array]:
+    """Return the log-likelihood by dynamax's extended or unscented filter; as the linear one."""
+    series = dynamax_series(contest.filter)(problem)
+    return lambda z: jnp.asarray(series(z)[1])
+
+
 def check(contest: Contest, likelihood: Callable[[Array], Array], problem: Nonlinear) -> None:
     """Stop unless the first run's log-likelihood is the NumPy filter's."""
     z = jnp.asarray(problem.z[:2], contest.dtype)
@@ -170,14 +176,7 @@ def prepared(contest: Contest, problem: Nonlinear) -> Callable[[Array], Any]:
         filter = own_filter(contest.filter)
         check(contest, single_of(filter, problem, contest.dtype), problem)
         return bank_of(filter, problem, contest.dtype)
-    if contest.filter == "kf":
-        one = dynamax_linear(narrow)
-    else:
-        series = dynamax_series(contest.filter)(narrow)
-
-        def one(z: Array) -> Array:
-            return jnp.asarray(series(z)[1])
-
+    one = dynamax_linear(narrow) if contest.filter == "kf" else dynamax_nonlinear(contest, narrow)
     check(contest, jax.jit(jax.vmap(one)), problem)
     return jax.jit(jax.vmap(jax.vmap(one)))
 

@@ -30,7 +30,7 @@ def test_product_under_vmap(axes: tuple[int | None, int | None]) -> None:
     """Of a gradient and inside one; a factor that is not mapped stays as it is."""
     factors = RNG.normal(size=(2, 3)), RNG.normal(size=(3, 4))
     A, B = (
-        factor if axis is None else np.stack([factor, 2 * factor, -factor], axis)
+        jnp.asarray(factor if axis is None else np.stack([factor, 2 * factor, -factor], axis))
         for factor, axis in zip(factors, axes, strict=True)
     )
 
@@ -101,6 +101,7 @@ def test_a_backward_pass_factors_nothing_again() -> None:
         return negative_log_likelihood(kf(model), params, jnp.zeros(5), observations)
 
     text = jax.jit(jax.grad(loss)).lower(0.1).compile().as_text()
+    assert text is not None
     loops = [part for part in text.split("\n\n") if " sqrt(" in part]
     assert loops
     assert not any("transpose(jvp" in line for line in text.splitlines() if " sqrt(" in line)
