@@ -162,11 +162,12 @@ ORDER = (
     "recorded.figures",
     "options",
     "report",
+    "doctor",
     "cli",
     "__main__",
 )
 EDGES = {"matplotlib", "rich", "tyro"}
-EDGE_MODULES = {"plotting", "report", "options"}
+EDGE_MODULES = {"plotting", "report", "doctor", "options"}
 
 
 def modules() -> dict[str, Path]:
