@@ -171,8 +171,7 @@ def test_ten_thousand_runs_of_the_linear_chain_hold_in_memory() -> None:
         from pathlib import Path
         import jax
         jax.config.update("jax_enable_x64", True)
-        from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs
-from jaxnav.studies.immae.config import ImmaeConfig
+        from jaxnav.studies.immae.config import ImmaeConfig
         from jaxnav.studies.immae.study import run_campaign
         def peak():
             # getrusage would count what the parent held when it started this process
