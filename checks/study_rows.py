@@ -2,7 +2,7 @@
 
 Usage: python checks/study_rows.py [STUDY ...] [--record DIR]
 
-Every study is run with few runs and seed 0, and what it keeps of each run is compared with
+Every study on record is run with few runs and seed 0, and what it keeps of each run is compared with
 ``study_rows.json`` beside this script: 1e-9 relative to the largest entry of the array along the
 runs. What differs by more is printed, with the run, and the exit code is 1. ``--record DIR`` takes
 the rows from results that ``jaxnav run --out`` has left in DIR/STUDY, one folder a scenario, and
@@ -97,8 +97,11 @@ def main() -> int:
         RECORD.write_text(json.dumps(recorded(args.record)) + "\n")
         return 0
     expected = json.loads(RECORD.read_text())
+    missing = [name for name in args.studies if name not in expected]
+    if missing:
+        parser.error(f"no rows of {missing[0]} are on record; make them with --record DIR")
     said = []
-    for study in args.studies or KEPT:
+    for study in args.studies or expected:
         found = differences(study, computed(study), expected[study])
         print(f"{study}: {'differs' if found else 'as before'}", flush=True)
         said += found
