@@ -2,7 +2,7 @@
 
 Usage: python checks/study_rows.py [STUDY ...] [--record DIR]
 
-Every study on record is run with few runs and seed 0, and what it keeps of each run is compared with
+Every study on record is run with few runs and seed 0; what it keeps of each run is compared with
 ``study_rows.json`` beside this script: 1e-9 relative to the largest entry of the array along the
 runs. What differs by more is printed, with the run, and the exit code is 1. ``--record DIR`` takes
 the rows from results that ``jaxnav run --out`` has left in DIR/STUDY, one folder a scenario, and
