@@ -76,15 +76,6 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
     names = tuple(rules)
     estimate_members = jax.vmap(filter.estimate)
 
-    # What the rules have in common is done for all of them at once: one body to compile.
-    def stacked(state: PanelState) -> Array:
-        return jnp.stack([state.log_weights[name] for name in names])
-
-    def by_name(results: Any) -> dict[str, Any]:
-        return {
-            name: jax.tree.map(lambda leaf, i=i: leaf[i], results) for i, name in enumerate(names)
-        }
-
     def init(params: BankParams) -> PanelState:
         members = jax.vmap(filter.init)(params.members)
         count = jax.tree.leaves(params.members)[0].shape[0]
@@ -116,7 +107,7 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
             )
             for name in names
         }
-        infos = by_name(jax.vmap(mixture_info, (0, None))(stacked(state), info))
+        infos = _by_name(names, jax.vmap(mixture_info, (0, None))(_stacked(names, state), info))
         memories = {name: memory for name, (memory, _) in moved.items()}
         log_weights = {name: weights for name, (_, weights) in moved.items()}
         return PanelState(members, memories, log_weights, state.step), infos
@@ -127,13 +118,26 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
         def mixed(log_weights: Array) -> Gaussian:
             return moment_match(log_weights, members, filter.retract, filter.local)
 
-        return by_name(jax.vmap(mixed)(stacked(state)))
+        return _by_name(names, jax.vmap(mixed)(_stacked(names, state)))
 
     def restart(state: PanelState, given: Gaussian) -> PanelState:
         members = jax.vmap(filter.restart, in_axes=(0, None))(state.members, given)
         return state._replace(members=members)
 
     return Filter(init, predict, update, estimate, restart, filter.retract, filter.local)
+
+
+# What the rules of a panel have in common is done for all of them at once: one body to compile.
+
+
+def _stacked(names: tuple[str, ...], state: PanelState) -> Array:
+    """Return the log-weights ``(rules, M)`` of a panel in the order of the names."""
+    return jnp.stack([state.log_weights[name] for name in names])
+
+
+def _by_name(names: tuple[str, ...], results: Any) -> dict[str, Any]:
+    """Return results with a leading axis of rules as a mapping by their names."""
+    return {name: jax.tree.map(lambda leaf, i=i: leaf[i], results) for i, name in enumerate(names)}
 
 
 def bank(filter: Filter, rule: WeightRule) -> Filter:
