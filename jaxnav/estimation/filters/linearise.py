@@ -12,15 +12,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.experimental.layout import Layout, with_layout_constraint
 
 from jaxnav.estimation.types import Input, LinearMap, Model, Params, Point
 from jaxnav.numerics.linalg import matmul
 
 ColumnMap = Callable[[Array], Array]
 """A linear map of columns ``(n, k)``."""
-
-BY_ROWS = Layout((0, 1))
 
 
 def transition_map(
@@ -101,11 +98,4 @@ def _derivative(function: Callable[[Array], Array], x: Point, n: int) -> ColumnM
 def _columns(jacobian: LinearMap) -> ColumnMap:
     if not callable(jacobian):
         return lambda columns: matmul(jacobian, columns)
-    mapped = jax.vmap(jacobian, in_axes=1, out_axes=1)
-
-    def pushed(columns: Array) -> Array:
-        # vmap works on rows of columns; written like that, the blocks of a vector alternate in the
-        # innermost loop, which then takes one number at a time.
-        return with_layout_constraint(mapped(columns), BY_ROWS)
-
-    return pushed
+    return jax.vmap(jacobian, in_axes=1, out_axes=1)
