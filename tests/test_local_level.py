@@ -246,7 +246,7 @@ def test_constant_increments_are_compensated_for_the_turn_alone() -> None:
 ARC = {"steps": 48_000, "step": 1 / 400}
 
 
-def test_perfect_increments_reproduce_the_arc() -> None:
+def test_perfect_increments_reproduce_the_arc(optimised_programs: None) -> None:
     truth = fly_arc(ArcProfile(), **ARC)
     dvel = coning_and_sculling(truth.dtheta, truth.dvel)[1]
     solution = mechanise(at(truth.state, 0), truth.dtheta, dvel, ARC["step"], every=400)
