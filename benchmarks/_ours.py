@@ -13,7 +13,7 @@ from jaxnav.estimation.banks.mixture import BankState, mmae
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, Model, Obs
+from jaxnav.estimation.types import Filter, Model, SureObs
 from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsParams, sins_cns
 
 
@@ -69,7 +69,7 @@ def _study_run(bank: Filter, inputs_of: Callable[[Any, Array], Any]) -> Callable
     def run_one(key: Array, shared: Any) -> RunOutput:
         keys, z, source, params = shared
         index = run_index(keys, key)
-        observations = Obs(z[index], jnp.ones(z.shape[1:], bool))
+        observations = SureObs(z[index], jnp.ones(z.shape[1:], bool))
         inputs = inputs_of(source, index)
         attitude = run(bank, params, inputs, observations, record=_attitude).record
         mean, square = jnp.mean(attitude, axis=0), jnp.mean(attitude**2, axis=0)

@@ -28,7 +28,8 @@ References:
     Titterton and Weston (2004), Strapdown Inertial Navigation Technology.
 """
 
-from importlib import import_module
+from difflib import get_close_matches
+from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -120,6 +121,9 @@ if TYPE_CHECKING:
         FilterParams as FilterParams,
     )
     from jaxnav.estimation.types import (
+        Flag as Flag,
+    )
+    from jaxnav.estimation.types import (
         Gaussian as Gaussian,
     )
     from jaxnav.estimation.types import (
@@ -130,6 +134,9 @@ if TYPE_CHECKING:
     )
     from jaxnav.estimation.types import (
         Obs as Obs,
+    )
+    from jaxnav.estimation.types import (
+        SureObs as SureObs,
     )
     from jaxnav.estimation.types import (
         WeightRule as WeightRule,
@@ -186,10 +193,12 @@ _HOMES = {
     "jaxnav.estimation.types": (
         "Filter",
         "FilterParams",
+        "Flag",
         "Gaussian",
         "Info",
         "Model",
         "Obs",
+        "SureObs",
         "WeightRule",
         "observed",
         "replicate",
@@ -202,6 +211,17 @@ __all__ = sorted(_HOME_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use, so that ``jaxnav --help`` need not wait for JAX."""
+    if name == "__version__":
+        return metadata.version("jaxnav")
     if name not in _HOME_OF:
-        raise AttributeError(f"module 'jaxnav' has no attribute {name!r}")
+        folded = {known.casefold(): known for known in _HOME_OF}
+        close = get_close_matches(name.casefold(), folded, n=1)
+        hint = f"; did you mean {folded[close[0]]!r}?" if close else ""
+        raise AttributeError(f"module 'jaxnav' has no attribute {name!r}{hint}")
     return getattr(import_module(_HOME_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List the public names, imported or not."""
+    own = (name for name in globals() if name.startswith("__"))
+    return sorted({*own, *_HOME_OF, "__version__"})

@@ -291,7 +291,8 @@ def test_covariance_is_shared_by_runs_that_share_their_inputs() -> None:
     case = CASES["kf"]
 
     def covariance_and_mean(z: Array) -> tuple[Array, Array]:
-        final = run(case.filter, case.params, PROBLEM.inputs, Obs(z, PROBLEM.valid)).final
+        observations = SureObs(z, PROBLEM.valid)
+        final = run(case.filter, case.params, PROBLEM.inputs, observations).final
         return final.P, final.x
 
     # vmap refuses an output axis of None unless the value does not depend on the mapped input

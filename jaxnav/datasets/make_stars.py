@@ -1,4 +1,4 @@
-"""Make the table of bright stars from a copy of the Hipparcos catalogue.
+"""Make the table of bright stars from a copy of the Hipparcos catalogue in its new reduction.
 
     python -m jaxnav.datasets.make_stars SOURCE [--magnitude 6.5] [--out FILE]
 
@@ -17,8 +17,9 @@ from jaxnav.datasets.stars import BUNDLED, COLUMNS, read_rows
 SOURCE_COLUMNS = ("source_id", "ra", "dec", "pmra", "pmdec", "phot_g_mean_mag")
 FORMATS = ("{:.0f}", "{:.7f}", "{:.7f}", "{:.2f}", "{:.2f}", "{:.2f}")
 HEADING = """\
-# Stars of the Hipparcos catalogue (ESA 1997, SP-1200) to magnitude Hp {:g}, ICRS, epoch J1991.25.
-# Proper motion in right ascension is times cos(declination).
+# Stars of the Hipparcos catalogue in its new reduction (van Leeuwen 2007, A&A 474(2), CDS I/311)
+# to magnitude Hp {:g}, ICRS, epoch J1991.25. Proper motion in right ascension is times
+# cos(declination).
 """
 
 

@@ -9,7 +9,8 @@ motion (that in right ascension times the cosine of the declination), magnitude.
 with ``#`` are comments.
 
 References:
-    ESA (1997), The Hipparcos and Tycho Catalogues, ESA SP-1200.
+    van Leeuwen (2007), Validation of the new Hipparcos reduction, A&A 474(2), catalogue I/311 of
+    the CDS; ESA (1997), The Hipparcos and Tycho Catalogues, ESA SP-1200, for the stars' numbers.
 """
 
 from pathlib import Path

@@ -96,16 +96,16 @@ def linearised_at_truth(model: Model, truth: Callable[[Input], tuple[Point, Poin
 
     def predict(params: FilterParams, state: KalmanState, u: Input) -> KalmanState:
         before, after = truth(u)
-        error = errors.predict(params, KalmanState(model.local(before, state.x), state.P), u)
-        return KalmanState(model.retract(after, error.x), error.P)
+        error = errors.predict(params, state._replace(x=model.local(before, state.x)), u)
+        return error._replace(x=model.retract(after, error.x))
 
     def update(
         params: FilterParams, state: KalmanState, u: Input, obs: Obs
     ) -> tuple[KalmanState, Info]:
         _, after = truth(u)
         nu = masked_innovation(model, obs, model.observe(params.model, after, u))
-        at = KalmanState(model.local(after, state.x), state.P)
-        error, info = errors.update(params, at, u, Obs(nu, obs.valid))
-        return KalmanState(model.retract(after, error.x), error.P), info
+        at = state._replace(x=model.local(after, state.x))
+        error, info = errors.update(params, at, u, obs._replace(z=nu))
+        return error._replace(x=model.retract(after, error.x)), info
 
     return ekf(model)._replace(predict=predict, update=update)

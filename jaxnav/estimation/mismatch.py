@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.innovation import innovation_info, mask_noise
+from jaxnav.estimation.filters.innovation import heard_by, innovation_info, mask_noise
 from jaxnav.estimation.filters.linearise import jacobians
 from jaxnav.estimation.types import (
     Filter,
@@ -84,15 +84,14 @@ def mismatched(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> F
     ) -> tuple[MismatchState, Info]:
         n = state.actual.shape[0]
         _, H = jacobians(model, params.actual.model, state.x, u, n)
-        H = jnp.where(obs.valid[:, None], H, 0)
-
-        def noise(own: FilterParams) -> Array:
-            return mask_noise(model.observation_noise(own.model, state.x, u), obs.valid)
-
-        S = symmetrise(H @ state.believed @ H.T) + noise(params.believed)
+        told = heard_by(model, params.believed.model, state.x, u, obs)
+        valid = told.obs.valid
+        H = jnp.where(valid[:, None], H, 0)
+        noise = mask_noise(model.observation_noise(params.actual.model, state.x, u), valid)
+        S = symmetrise(H @ state.believed @ H.T) + told.noise
         root = cholesky(S)
         K = solve_lower_transposed(root.factor, solve_lower(root.factor, H @ state.believed)).T
-        K = jnp.where(obs.valid[None] & root.positive_definite, K, 0)
+        K = jnp.where(valid[None] & root.positive_definite, K, 0)
         A = jnp.eye(n, dtype=H.dtype) - K @ H
 
         def corrected(P: Array, R: Array) -> Array:
@@ -100,10 +99,10 @@ def mismatched(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> F
 
         moved = MismatchState(
             state.x,
-            corrected(state.believed, noise(params.believed)),
-            corrected(state.actual, noise(params.actual)),
+            corrected(state.believed, told.noise),
+            corrected(state.actual, noise),
         )
-        return moved, innovation_info(jnp.zeros_like(S[0]), S, root, obs.valid)
+        return moved, innovation_info(jnp.zeros_like(S[0]), S, root, told, jnp.array(False))
 
     def estimate(state: MismatchState) -> Gaussian:
         return Gaussian(state.x, state.actual)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.compiling import compiled, cores
+from jaxnav.estimation.checks import described
 
 TILE = 8
 """Number of runs in a tile on a CPU: few are then filled up in vain, the working set of a bank of
@@ -92,8 +93,10 @@ def monte_carlo(
         The campaign.
 
     Raises:
-        ValueError: If ``runs``, ``tile`` or ``threads`` is not positive, or there is no device.
+        ValueError: If ``runs``, ``tile`` or ``threads`` is not positive, there is no device, the
+            key is not one, or ``run_one`` returns something else than a :class:`RunOutput`.
     """
+    _require_key(key)
     chosen = list(jax.local_devices()[:1] if devices is None else devices)
     if not chosen:
         raise ValueError("devices is empty; a Monte Carlo study needs at least one")
@@ -103,8 +106,8 @@ def monte_carlo(
     if threads is None:
         threads = max(cores() // len(chosen), 1) if on_cpu else 1
     for name, value in (("runs", runs), ("tile", tile), ("threads", threads)):
-        if value < 1:
-            raise ValueError(f"{name} is {value}; it must be at least 1")
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{name} is {value}; it must be a whole number of at least 1")
     starts = range(0, runs, tile)
     inputs = [jax.device_put((key, jnp.int32(runs), shared), device) for device in chosen]
     free: SimpleQueue[Any] = SimpleQueue()
@@ -143,6 +146,14 @@ def monte_carlo(
     return Campaign(rows, total, joined, finite)
 
 
+def _require_key(key: Any) -> None:
+    """Raise ``ValueError`` unless it is one random key."""
+    typed = isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    raw = isinstance(key, Array) and key.dtype == jnp.uint32 and key.ndim == 1
+    if not raw and not (typed and key.ndim == 0):
+        raise ValueError(f"key is {described(key)}; it must be one key, as jax.random.key(0)")
+
+
 def _add(total: Any, curve: Any) -> Any:
     """Add a tile's sum on the host, in the order of the runs, so that the result is fixed."""
     if total is None:
@@ -168,6 +179,11 @@ def _run_tile(
     indices = start + jnp.arange(tile, dtype=jnp.int32)
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
     output = jax.vmap(run_one, in_axes=(0, None))(keys, shared)
+    if not isinstance(output, RunOutput):
+        raise ValueError(
+            f"run_one returns {described(output)}; it must return RunOutput(row), with numbers and "
+            "small arrays as the row"
+        )
     finite = jax.vmap(_all_finite)(output.row)
     counted = finite & (indices < runs)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.compiling import compiled
+from jaxnav.estimation.checks import require_filter, require_observations
 from jaxnav.estimation.types import Filter, Input, Model, Obs, Params
 from jaxnav.numerics.conditioning import KEPT
 
@@ -51,9 +52,12 @@ def run(
         The trace.
 
     Raises:
-        ValueError: If the leading axes of inputs and observations differ, or are no multiple of
-            ``every``.
+        ValueError: If the filter, its parameters or the observations are not what they must be, the
+            leading axes of inputs and observations differ, or are no multiple of ``every``.
     """
+    require_filter(filter)
+    require_observations(observations)
+    filter.check(params)
     steps = {leaf.shape[0] for leaf in jax.tree.leaves((inputs, observations))}
     if len(steps) != 1:
         raise ValueError(

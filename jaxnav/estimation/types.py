@@ -34,8 +34,17 @@ class Flag(IntFlag):
             skipped.
         ILL_CONDITIONED: The factorisation kept fewer than about three digits; the update was made.
         ALL_MODELS_VETOED: No member of a bank had a finite likelihood: the weights were kept.
-        INDEFINITE: A covariance lost its positive definiteness in drawing sigma points or in a
-            downdate: the nearest factor at hand was used.
+        INDEFINITE: A covariance (the prior, the process noise, that of the state) was not symmetric
+            and positive semi-definite when it was needed; a root of it was made by the nearest
+            factor at hand.
+        NOT_FINITE: A channel that was said to be valid had a value that is not finite, or noise
+            that is not a number: it was left out as if it were missing.
+        INVALID_NOISE: The observation noise was no covariance, having a negative variance or a
+            correlation beyond one; it was used as it was.
+        NO_WEIGHTS: A weight rule gave no probabilities, as with parameters outside their domain:
+            the bank's estimate means nothing from here on.
+        REFUSED: A gate left channels out that contradict the prediction.
+        REOPENED: A gate let channels pass that still contradict it, after having refused many.
     """
 
     NO_OBSERVATION = 1
@@ -43,6 +52,19 @@ class Flag(IntFlag):
     ILL_CONDITIONED = 4
     ALL_MODELS_VETOED = 8
     INDEFINITE = 16
+    NOT_FINITE = 32
+    INVALID_NOISE = 64
+    NO_WEIGHTS = 128
+    REFUSED = 256
+    REOPENED = 512
+
+
+def flags_of(raised: dict[Flag, Array]) -> Array:
+    """Return the sum of the flags that are raised."""
+    return sum(
+        (jnp.where(on, int(flag), 0).astype(jnp.int32) for flag, on in raised.items()),
+        jnp.zeros((), jnp.int32),
+    )
 
 
 class Gaussian(NamedTuple):
@@ -55,11 +77,23 @@ class Gaussian(NamedTuple):
 class Obs(NamedTuple):
     """An observation: values ``z`` ``(m,)`` and which channels arrived, ``valid`` ``(m,)``.
 
-    A missing channel is a ``False``; its value is never used, not even in a product with zero.
+    A missing channel is a ``False``; its value is never used, not even in a product with zero. A
+    channel whose noise has an infinite variance is missing too. One that is valid and has a value
+    that is not finite is left out and raises :attr:`Flag.NOT_FINITE`.
     """
 
     z: Float[Array, " m"]
     valid: Mask
+
+
+class SureObs(Obs):
+    """An :class:`Obs` of which it is sure that every valid value is finite, as in a simulation.
+
+    Which channels count then depends on ``valid`` alone, so that runs with one mask share their
+    covariance recursion under ``vmap``. A value that is not finite after all spoils its run.
+    """
+
+    __slots__ = ()
 
 
 class Info(NamedTuple):
@@ -69,7 +103,7 @@ class Info(NamedTuple):
         innovation: ``(m,)`` measured minus predicted; zero in invalid channels.
         innovation_cov: ``(m, m)``; an invalid channel has the row of the identity.
         log_likelihood: Log-density of the valid channels given the past [nats]; ``-inf`` if the
-            update failed, which rules a member of a bank out for good; 0 for a bank all of whose
+            update failed, which rules a member of a bank out for good, and for a bank all of whose
             members failed.
         nis: Normalised innovation squared, chi-square with ``sum(valid)`` degrees of freedom.
         iterations: Number of iterations of the update.
@@ -145,6 +179,10 @@ class Model(NamedTuple):
     noisy: NonAdditive | None = None
 
 
+def _anything(*given: Any) -> None:
+    del given
+
+
 def _itself(u: Input) -> Input:
     return u
 
@@ -215,6 +253,8 @@ class Filter(NamedTuple):
             is how the members of an interacting bank exchange what they know.
         retract: That of the estimate's manifold, as in :class:`Model`.
         local: That of the estimate's manifold, as in :class:`Model`.
+        check: ``(params)`` raises ``ValueError`` for parameters that are not those of this filter:
+            by their types and shapes, and by their values where these are concrete. A run asks it.
     """
 
     init: Callable[[Params], Any]
@@ -224,6 +264,7 @@ class Filter(NamedTuple):
     restart: Callable[[Any, Gaussian], Any]
     retract: Callable[[Point, Array], Point] = add
     local: Callable[[Point, Point], Array] = subtract
+    check: Callable[[Params], None] = _anything
 
 
 class WeightPredict(Protocol):
@@ -253,11 +294,13 @@ class WeightRule(NamedTuple):
         init: ``(params, log_weights) -> state``.
         predict: See :class:`WeightPredict`; what it returns weighs the predictive likelihood.
         update: See :class:`WeightUpdate`.
+        check: ``(params, M)`` raises ``ValueError``, as :attr:`Filter.check` does.
     """
 
     init: Callable[[Params, Array], Any]
     predict: WeightPredict
     update: WeightUpdate
+    check: Callable[[Params, int], None] = _anything
 
 
 def observed(z: Array) -> Obs:
@@ -265,7 +308,7 @@ def observed(z: Array) -> Obs:
 
     For recorded data, where NaN or an infinity marks a lost channel. The mask then depends on the
     data, so a batch of runs cannot share its covariance recursion; simulations that lose no data
-    should build ``Obs(z, valid)`` with one mask for all runs.
+    should build :class:`SureObs` with one mask for all runs.
     """
     finite = jnp.isfinite(z)
     return Obs(jnp.where(finite, z, 0), finite)

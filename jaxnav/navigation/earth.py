@@ -113,8 +113,26 @@ def transport_rate(position: Array, velocity: Array, earth: Earth = WGS84) -> Ar
     return jnp.stack([-north, east, east * jnp.tan(latitude)])
 
 
+def require_wide(position: Array) -> None:
+    """Raise ``ValueError`` for a position on the Earth in floats of 32 bits.
+
+    They resolve half a metre there; what a step adds to a position is lost in their rounding.
+    """
+    dtype = jnp.result_type(position)
+    if jnp.finfo(dtype).bits < 64:
+        raise ValueError(
+            f"a position on the Earth is of {dtype}, which resolves half a metre; it must be of "
+            'float64, for which jax.config.update("jax_enable_x64", True) comes first'
+        )
+
+
 def displaced(position: Array, offset: Array, earth: Earth = WGS84) -> Array:
-    """Return the geodetic position an offset ``(3,) [m]`` east, north, up away, to first order."""
+    """Return the geodetic position an offset ``(3,) [m]`` east, north, up away, to first order.
+
+    Raises:
+        ValueError: If the position is of 32 bits.
+    """
+    require_wide(position)
     return position + offset[jnp.array([1, 0, 2])] / metres_per_radian(position, earth)
 
 
@@ -122,7 +140,12 @@ def offset_between(position: Array, other: Array, earth: Earth = WGS84) -> Array
     """Return east, north, up ``(3,) [m]`` from a geodetic position to another one near.
 
     Inverse of :func:`displaced`; the difference of longitudes is taken within half a turn.
+
+    Raises:
+        ValueError: If a position is of 32 bits.
     """
+    require_wide(position)
+    require_wide(other)
     difference = other - position
     turn = wrapped_angle(other[1], position[1])
     metres = metres_per_radian(position, earth) * difference.at[1].set(turn)
@@ -156,7 +179,12 @@ def gravity_gradient_launch_inertial(r: Array, radius: Array | float) -> Array:
 
 
 def ecef_from_geodetic(geodetic: Array) -> Array:
-    """Return the Earth-fixed position ``(3,) [m]`` of latitude, longitude [rad] and height [m]."""
+    """Return the Earth-fixed position ``(3,) [m]`` of latitude, longitude [rad] and height [m].
+
+    Raises:
+        ValueError: If the position is of 32 bits.
+    """
+    require_wide(geodetic)
     latitude, longitude, height = geodetic[0], geodetic[1], geodetic[2]
     s, c = jnp.sin(latitude), jnp.cos(latitude)
     normal = transverse_radius(latitude)

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxnav.compiling import accepted_options, compiled
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, Obs
+from jaxnav.estimation.types import Filter, Obs, SureObs
 
 CALLS = 3000
 WARM_UP = 300
@@ -58,7 +58,7 @@ def step_latency(filter: Filter, params: Any, inputs: Any, observations: Obs) ->
     def step(packed: Array, data: Array, valid: Array) -> Array:
         u, z = unpack_data(data)
         predicted = filter.predict(params, unpack_state(packed), u)
-        return ravel_pytree(filter.update(params, predicted, u, Obs(z, valid))[0])[0]
+        return ravel_pytree(filter.update(params, predicted, u, SureObs(z, valid))[0])[0]
 
     def timed(state: Array) -> tuple[Array, float]:
         begin = time.perf_counter()

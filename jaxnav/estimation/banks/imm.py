@@ -4,7 +4,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxnav.estimation.banks.mixture import (
@@ -12,12 +11,11 @@ from jaxnav.estimation.banks.mixture import (
     BankState,
     bank,
     likeliest,
+    require_bank_params,
 )
 from jaxnav.estimation.banks.weights import active, bayes, switched
+from jaxnav.estimation.checks import require_log_prior, require_number, require_transition_matrix
 from jaxnav.estimation.types import Filter, Gaussian, Info, Input, Obs
-
-SUM_TOLERANCE = 1e-6
-"""How far from one a row of a transition matrix may sum: rounding, and matrices kept in float32."""
 
 
 def imm(filter: Filter) -> Filter:
@@ -46,8 +44,13 @@ def imm(filter: Filter) -> Filter:
     def weighed(params: BankParams) -> BankParams:
         return params._replace(rule=())
 
+    def check(params: BankParams) -> None:
+        count = require_bank_params(filter, params)
+        require_transition_matrix(params.rule, count)
+        require_log_prior(params.log_prior, count)
+
     def init(params: BankParams) -> BankState:
-        _require_size(params.members, params.rule)
+        check(params)
         return base.init(weighed(params))
 
     def predict(params: BankParams, state: BankState, u: Input) -> BankState:
@@ -60,7 +63,7 @@ def imm(filter: Filter) -> Filter:
     def update(params: BankParams, state: BankState, u: Input, obs: Obs) -> tuple[BankState, Info]:
         return base.update(weighed(params), state, u, obs)
 
-    return base._replace(init=init, predict=predict, update=update)
+    return base._replace(init=init, predict=predict, update=update, check=check)
 
 
 def imm_params(members: Any, transition: Array, log_prior: Any = None) -> BankParams:
@@ -75,29 +78,9 @@ def imm_params(members: Any, transition: Array, log_prior: Any = None) -> BankPa
         ValueError: If the matrix has another size, a negative entry, or a row that does not sum to
             one.
     """
-    _require_size(members, transition)
-    matrix = np.asarray(transition, float)
-    if not np.all(matrix >= 0):
-        raise ValueError(
-            f"the transition matrix has the entry {matrix.min():g}; none may be negative"
-        )
-    sums = matrix.sum(axis=1)
-    worst = int(np.argmax(np.abs(sums - 1)))
-    if not abs(sums[worst] - 1) <= SUM_TOLERANCE:
-        raise ValueError(
-            f"row {worst} of the transition matrix sums to {sums[worst]:g}; each must sum to 1"
-        )
-    return BankParams(members, transition, log_prior)
-
-
-def _require_size(members: Any, transition: Array) -> None:
-    """Raise ``ValueError`` unless a transition matrix has the size of the bank."""
     count = jax.tree.leaves(members)[0].shape[0]
-    if jnp.shape(transition) != (count, count):
-        raise ValueError(
-            f"the transition matrix is {jnp.shape(transition)}; "
-            f"a bank of {count} members needs ({count}, {count})"
-        )
+    require_transition_matrix(transition, count)
+    return BankParams(members, transition, log_prior)
 
 
 def uniform_switching(count: int, probability: Array | float) -> Array:
@@ -106,7 +89,11 @@ def uniform_switching(count: int, probability: Array | float) -> Array:
     Args:
         count: Number of models.
         probability: To leave a model in a step, in [0, 1].
+
+    Raises:
+        ValueError: If a concrete probability is outside its domain.
     """
+    require_number("the probability to leave a model", probability, "[0, 1]", 0, 1)
     away = probability / max(count - 1, 1)
     stay = 1 - probability if count > 1 else 1.0
     return jnp.where(jnp.eye(count, dtype=bool), stay, away)

@@ -19,6 +19,7 @@ from jaxnav.estimation.banks.weights import (
     normalise,
     windowed_reset,
 )
+from jaxnav.estimation.checks import described, require_log_prior, require_members
 from jaxnav.estimation.types import (
     Filter,
     Flag,
@@ -28,6 +29,7 @@ from jaxnav.estimation.types import (
     Obs,
     WeightRule,
     add,
+    flags_of,
     subtract,
 )
 from jaxnav.numerics.linalg import cholesky, solve_lower, symmetrise
@@ -76,7 +78,23 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
     names = tuple(rules)
     estimate_members = jax.vmap(filter.estimate)
 
+    def check(params: BankParams) -> None:
+        count = require_bank_params(filter, params)
+        for given in ("rule", "log_prior"):
+            value = getattr(params, given)
+            if value is None and given == "log_prior":
+                continue
+            if not isinstance(value, Mapping) or set(value) != set(names):
+                found = ", ".join(value) if isinstance(value, Mapping) else described(value)
+                raise ValueError(
+                    f"{given} of a panel is {found}; it must be a mapping with {', '.join(names)}"
+                )
+        for name in names:
+            rules[name].check(params.rule[name], count)
+            require_log_prior(params.log_prior and params.log_prior[name], count)
+
     def init(params: BankParams) -> PanelState:
+        check(params)
         members = jax.vmap(filter.init)(params.members)
         count = jax.tree.leaves(params.members)[0].shape[0]
         dtype = jax.tree.leaves(members)[0].dtype
@@ -124,7 +142,7 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
         members = jax.vmap(filter.restart, in_axes=(0, None))(state.members, given)
         return state._replace(members=members)
 
-    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local)
+    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
 
 
 # What the rules of a panel have in common is done for all of them at once: one body to compile.
@@ -164,7 +182,13 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
     def narrow(state: PanelState) -> BankState:
         return BankState(state.members, state.rule[""], state.log_weights[""], state.step)
 
+    def check(params: BankParams) -> None:
+        count = require_bank_params(filter, params)
+        rule.check(params.rule, count)
+        require_log_prior(params.log_prior, count)
+
     def init(params: BankParams) -> BankState:
+        check(params)
         return narrow(single.init(widen(params)))
 
     def predict(params: BankParams, state: BankState, u: Input) -> BankState:
@@ -180,7 +204,17 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
     def restart(state: BankState, given: Gaussian) -> BankState:
         return narrow(single.restart(wide_state(state), given))
 
-    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local)
+    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
+
+
+def require_bank_params(filter: Filter, params: Any) -> int:
+    """Raise ``ValueError`` unless parameters are those of a bank; return the number of members."""
+    if not isinstance(params, BankParams):
+        raise ValueError(
+            f"params is {described(params)}; a bank takes BankParams(members, rule), its members' "
+            "parameters with a leading model axis, as jaxnav.replicate(params, count) gives"
+        )
+    return require_members(filter.check, params.members)
 
 
 def rewatch(rule: WeightRule) -> Filter:
@@ -237,10 +271,7 @@ def _log_prior(log_prior: Any, name: str, count: int, dtype: Any) -> Array:
     given = None if log_prior is None else log_prior[name]
     if given is None:
         return normalise(jnp.zeros((count,), dtype))
-    given = jnp.asarray(given, dtype)
-    if given.shape != (count,):
-        raise ValueError(f"log_prior is {given.shape}; a bank of {count} members needs ({count},)")
-    return normalise(given)
+    return normalise(jnp.asarray(given, dtype))
 
 
 def moment_match(
@@ -297,8 +328,9 @@ def mixture_info(log_weights: Array, info: Info) -> Info:
 
     The log-likelihood is the mixture's, ``log sum w_i N(nu_i; 0, S_i)``; innovation, its covariance
     and the NIS are those of the moment-matched prediction of the members that did not fail. If all
-    failed the log-likelihood is 0 and :attr:`Flag.ALL_MODELS_VETOED` is raised.
+    failed the log-likelihood is ``-inf`` and :attr:`Flag.ALL_MODELS_VETOED` is raised.
     """
+    weighed = jnp.any(active(log_weights)) & ~jnp.any(jnp.isnan(log_weights))
     joint = log_weights + member_log_likelihood(info.log_likelihood)
     vetoed = ~jnp.any(active(joint))
     evidence = jax.nn.logsumexp(jnp.where(vetoed, 0, joint))
@@ -307,12 +339,12 @@ def mixture_info(log_weights: Array, info: Info) -> Info:
     root = cholesky(symmetrise(S))
     whitened = solve_lower(root.factor, innovation)
     used = active(log_weights)
-    raised = jnp.where(vetoed, int(Flag.ALL_MODELS_VETOED), 0).astype(jnp.int32)
+    raised = flags_of({Flag.ALL_MODELS_VETOED: vetoed & weighed, Flag.NO_WEIGHTS: ~weighed})
     bits = jnp.where(used, info.flags, 0)
     return Info(
         innovation=innovation,
         innovation_cov=S,
-        log_likelihood=jnp.where(vetoed, 0, evidence),
+        log_likelihood=jnp.where(weighed & ~vetoed, evidence, -jnp.inf),
         nis=jnp.where(root.positive_definite, jnp.sum(whitened * whitened), 0),
         iterations=jnp.max(jnp.where(used, info.iterations, 0)),
         flags=jax.lax.reduce(bits, jnp.zeros((), jnp.int32), jax.lax.bitwise_or, (0,)) | raised,

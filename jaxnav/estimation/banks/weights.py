@@ -17,6 +17,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    described,
+    require_fields,
+    require_number,
+    require_transition_matrix,
+)
 from jaxnav.estimation.types import Flag, Info, WeightRule
 
 
@@ -156,7 +164,14 @@ def penalty() -> WeightRule:
         told = info._replace(log_likelihood=jnp.where(usable, evidence, -jnp.inf))
         return count, _bayes_step(log_weights, told)
 
-    return WeightRule(init, _stay, update)
+    return WeightRule(init, _stay, update, _check_penalty)
+
+
+def _check_penalty(params: Penalty, count: int) -> None:
+    del count
+    domains = dict.fromkeys(("scale", "least", "normaliser"), NOT_NEGATIVE)
+    domains["memory"] = POSITIVE
+    require_fields("the parameter of penalty", params, Penalty, domains)
 
 
 class Floor(NamedTuple):
@@ -196,7 +211,15 @@ def floor(*, smooth: bool = False) -> WeightRule:
             raised = jnp.maximum(log_weights, jnp.log(params))
         return state, normalise(jnp.where(members, raised, -jnp.inf))
 
-    return WeightRule(_stateless, _stay, update)
+    def check(params: Any, count: int) -> None:
+        domain = (f"(0, 1/{count})", 0, 1 / count) if count > 1 else ("(0, 1]", 0, 1)
+        if smooth:
+            domains = {"bound": domain, "temperature": POSITIVE}
+            require_fields("the parameter of a smooth floor", params, Floor, domains)
+        else:
+            require_number("the floor of the weights", params, *domain)
+
+    return WeightRule(_stateless, _stay, update, check)
 
 
 def forget() -> WeightRule:
@@ -212,7 +235,11 @@ def forget() -> WeightRule:
         faded = params * jnp.where(members, log_weights, 0)
         return normalise(jnp.where(members, faded, -jnp.inf))
 
-    return WeightRule(_stateless, predict, _ignore_data)
+    def check(params: Any, count: int) -> None:
+        del count
+        require_number("the factor of forgetting", params, "(0, 1]", 0, 1)
+
+    return WeightRule(_stateless, predict, _ignore_data, check)
 
 
 def markov() -> WeightRule:
@@ -233,7 +260,11 @@ def markov() -> WeightRule:
         arrive = jnp.log(params) - jnp.log(others) + jnp.log(elsewhere)
         return normalise(jnp.where(members, jnp.logaddexp(stay, arrive), -jnp.inf))
 
-    return WeightRule(_stateless, predict, _ignore_data)
+    def check(params: Any, count: int) -> None:
+        del count
+        require_number("the probability to switch", params, "[0, 1]", 0, 1)
+
+    return WeightRule(_stateless, predict, _ignore_data, check)
 
 
 class Switched(NamedTuple):
@@ -287,7 +318,7 @@ def switch() -> WeightRule:
         del state, k
         return switched(log_weights, params).log_weights
 
-    return WeightRule(_stateless, predict, _ignore_data)
+    return WeightRule(_stateless, predict, _ignore_data, require_transition_matrix)
 
 
 class WindowedReset(NamedTuple):
@@ -324,7 +355,17 @@ def windowed_reset(*, smooth: bool = False) -> WeightRule:
         they can differ only if the second set starts anew every period whether or not the first is
         reset, which is what is done here. The paper gives neither period nor threshold.
     """
-    return WeightRule(_window_init, _stay, _smooth_reset if smooth else _hard_reset)
+    return WeightRule(_window_init, _stay, _smooth_reset if smooth else _hard_reset, _check_reset)
+
+
+def _check_reset(params: WindowedReset, count: int) -> None:
+    del count
+    domains = {
+        "period": ("[1, inf)", 1, jnp.inf),
+        "threshold": ("(0, 1]", 0, 1),
+        "temperature": POSITIVE,
+    }
+    require_fields("the parameter of windowed_reset", params, WindowedReset, domains)
 
 
 def _window_init(params: WindowedReset, log_weights: Array) -> Array:
@@ -382,7 +423,17 @@ def chain(*rules: WeightRule) -> WeightRule:
             memories.append(memory)
         return tuple(memories), log_weights
 
-    return WeightRule(init, predict, update)
+    def check(params: Any, count: int) -> None:
+        if type(params) is not tuple or len(params) != len(rules):
+            found = f"a tuple of {len(params)}" if type(params) is tuple else described(params)
+            raise ValueError(
+                f"the parameter of a chain is {found}; it must be a tuple of {len(rules)}, one "
+                "entry for each rule, () for a rule without parameters"
+            )
+        for rule, own in zip(rules, params, strict=True):
+            rule.check(own, count)
+
+    return WeightRule(init, predict, update, check)
 
 
 RULES: dict[str, Callable[..., WeightRule]] = {

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.checks import POSITIVE, require_part
 from jaxnav.estimation.filters.given_noise import given, with_given_noise
-from jaxnav.estimation.filters.innovation import noise_of_channels
+from jaxnav.estimation.filters.innovation import heard_by
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
 
 LARGEST_RATIO = 10.0
@@ -33,6 +34,14 @@ class Adaptation(NamedTuple):
     low: Array | float = 1e-2
     high: Array | float = 1e4
     temperature: Array | float = 0.02
+
+
+ADAPTATION_DOMAINS = {
+    "memory": ("[1, inf)", 1.0, jnp.inf),
+    "low": POSITIVE,
+    "high": POSITIVE,
+    "temperature": POSITIVE,
+}
 
 
 class AdaptiveState(NamedTuple):
@@ -85,7 +94,12 @@ def innovation_adaptive(
     """
     base = build(with_given_noise(model))
 
+    def check(params: FilterParams) -> None:
+        base.check(params)
+        require_part(params, "adaptation", Adaptation, ADAPTATION_DOMAINS)
+
     def init(params: FilterParams) -> AdaptiveState:
+        check(params)
         return AdaptiveState(base.init(params), jnp.zeros((), params.initial.cov.dtype))
 
     def predict(params: FilterParams, state: AdaptiveState, u: Input) -> AdaptiveState:
@@ -96,10 +110,10 @@ def innovation_adaptive(
         params: FilterParams, state: AdaptiveState, u: Input, obs: Obs
     ) -> tuple[AdaptiveState, Info]:
         own = Adaptation() if params.adaptation == () else params.adaptation
-        R = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
-        inner, info = base.update(given(params, 1.0, R), state.inner, u, obs)
-        moved = moved_log_factor(own, state.log_factor, info, obs, smooth=smooth)
-        return AdaptiveState(inner, moved), info
+        told = heard_by(model, params.model, base.estimate(state.inner).mean, u, obs)
+        inner, info = base.update(given(params, 1.0, told.noise), state.inner, u, told.obs)
+        moved = moved_log_factor(own, state.log_factor, info, told.obs, smooth=smooth)
+        return AdaptiveState(inner, moved), info._replace(flags=info.flags | told.flags)
 
     def estimate(state: AdaptiveState) -> Gaussian:
         return base.estimate(state.inner)
@@ -107,7 +121,7 @@ def innovation_adaptive(
     def restart(state: AdaptiveState, estimate: Gaussian) -> AdaptiveState:
         return state._replace(inner=base.restart(state.inner, estimate))
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
 
 
 def moved_log_factor(

@@ -1,18 +1,70 @@
 """What every update shares: masked channels, the verdict on an innovation, checks of shapes."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.types import Flag, Gaussian, Info, Model, Obs
+from jaxnav.estimation.types import Flag, Info, Model, Obs, SureObs, flags_of
 from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
 from jaxnav.numerics.linalg import Cholesky, log_det, solve_lower
+from jaxnav.numerics.roots import semidefinite_root
 
 ILL_CONDITIONED_EPS = 1e3
 """Multiple of the machine epsilon below which a Cholesky pivot is called ill-conditioned."""
+
+
+class Heard(NamedTuple):
+    """What an update takes of an observation.
+
+    Attributes:
+        obs: The observation; valid are the channels that can be used.
+        noise: Covariance ``(m, m)`` of its noise, the identity in the channels that are not.
+        flags: Sum of :class:`Flag`, for :func:`innovation_info`.
+    """
+
+    obs: Obs
+    noise: Array
+    flags: Array
+
+
+def heard(R: Array, obs: Obs) -> Heard:
+    """Return the channels of an observation that can be used, and their noise.
+
+    A channel of infinite variance is missing; one of which the value is not finite, or the noise
+    not a number, is left out with a flag.
+
+    Args:
+        R: Covariance ``(m, m)`` or its diagonal ``(m,)``.
+        obs: The observation.
+
+    Raises:
+        ValueError: If ``R`` has another size.
+    """
+    m = obs.valid.shape[0]
+    if R.shape not in ((m,), (m, m)):
+        raise ValueError(
+            f"the model's observation noise is {R.shape} and the observation has {m} channels; "
+            f"for these the noise must be ({m}, {m}) or ({m},)"
+        )
+    variance = R if R.ndim == 1 else jnp.diag(R)
+    known = obs.valid & (variance != jnp.inf)
+    broken = jnp.isnan(variance)
+    if not isinstance(obs, SureObs):
+        broken = broken | ~jnp.isfinite(obs.z)
+    valid = known & ~broken
+    improper = valid & (variance < 0)
+    if R.ndim == 2:
+        # A pair's bound is taken in roots: a product of two variances can leave the range.
+        sigma = jnp.sqrt(jnp.where(variance > 0, variance, 0))
+        both = valid[:, None] & valid[None]
+        slack = 1 + 1e3 * jnp.finfo(R.dtype).eps
+        beyond = ~(jnp.abs(R) <= slack * sigma[:, None] * sigma[None])
+        improper = improper | jnp.any(both & beyond, axis=1)
+    raised = {Flag.NOT_FINITE: jnp.any(known & broken), Flag.INVALID_NOISE: jnp.any(improper)}
+    return Heard(obs._replace(valid=valid), mask_noise(R, valid), flags_of(raised))
 
 
 def masked_innovation(model: Model, obs: Obs, z_pred: Array) -> Array:
@@ -35,14 +87,14 @@ def require_channels(obs: Obs, observed: tuple[int, ...]) -> None:
         )
 
 
-def noise_of_channels(model: Model, params: Any, x: Any, u: Any, obs: Obs) -> Array:
-    """Return a model's noise covariance ``(m, m)`` at a state, masked as by :func:`mask_noise`.
+def heard_by(model: Model, params: Any, x: Any, u: Any, obs: Obs) -> Heard:
+    """Return what can be used of an observation, with a model's noise at a state.
 
     Raises:
         ValueError: If observation, model and noise do not fit together.
     """
     require_channels(obs, jax.eval_shape(model.observe, params, x, u).shape)
-    return mask_noise(model.observation_noise(params, x, u), obs.valid)
+    return heard(model.observation_noise(params, x, u), obs)
 
 
 def mask_noise(R: Array, valid: Array) -> Array:
@@ -51,28 +103,19 @@ def mask_noise(R: Array, valid: Array) -> Array:
     Args:
         R: Covariance ``(m, m)`` or its diagonal ``(m,)``.
         valid: ``(m,)`` bool.
-
-    Raises:
-        ValueError: If ``R`` has another size.
     """
     m = valid.shape[0]
-    if R.shape not in ((m,), (m, m)):
-        raise ValueError(
-            f"the observation noise is {R.shape}; with {m} channels it must be ({m}, {m}) or ({m},)"
-        )
     dense = jnp.diag(R) if R.ndim == 1 else R
     both = valid[:, None] & valid[None, :]
     return jnp.where(both, dense, jnp.eye(m, dtype=R.dtype))
 
 
-def require_prior(model: Model, initial: Gaussian) -> None:
-    """Raise ``ValueError`` unless the covariance at t0 has the size of the tangent space."""
-    n = jax.eval_shape(model.local, initial.mean, initial.mean).shape[0]
-    if jnp.shape(initial.cov) != (n, n):
-        raise ValueError(
-            f"the initial covariance is {jnp.shape(initial.cov)}; the initial mean has {n} tangent "
-            f"coordinates, so it must be ({n}, {n})"
-        )
+def is_covariance(P: Array) -> Array:
+    """Return whether a matrix ``(n, n)`` is symmetric and positive semi-definite, to rounding."""
+    sigma = jnp.sqrt(jnp.maximum(jnp.diag(P), 0))
+    rounding = 1e3 * jnp.finfo(P.dtype).eps * sigma[:, None] * sigma[None]
+    symmetric = jnp.all(jnp.abs(P - P.T) <= rounding)
+    return symmetric & semidefinite_root(P).semidefinite
 
 
 def require_step(model: Model, x: Any, moved: Any, Q: Array) -> None:
@@ -96,8 +139,8 @@ def innovation_info(
     nu: Array,
     S: Array,
     root: Cholesky,
-    valid: Array,
-    indefinite: Array | None = None,
+    told: Heard,
+    indefinite: Array,
     *,
     rooted: bool = False,
     solution: Solved | None = None,
@@ -108,8 +151,8 @@ def innovation_info(
         nu: Innovation.
         S: Its covariance.
         root: The factor of ``S``.
-        valid: ``(m,)`` bool.
-        indefinite: Whether a covariance had to be mended in this step.
+        told: What was used of the observation.
+        indefinite: Whether a covariance was not positive semi-definite in this step.
         rooted: Whether the factor was computed and ``S`` is its square, which has half the digits:
             the derivative is then taken through the factor, else through ``S`` at less cost.
         solution: What :func:`~jaxnav.numerics.conditioning.solved` gave, where it is at hand.
@@ -124,6 +167,7 @@ def innovation_info(
         volume = log_volume(S, root.factor, known.inverse)
     usable = root.positive_definite
     nis = jnp.where(usable, distance, 0)
+    valid = told.obs.valid
     channels = jnp.sum(valid).astype(S.dtype)
     log_likelihood = -0.5 * (nis + volume + channels * math.log(2 * math.pi))
     few_digits = root.reciprocal_pivot < ILL_CONDITIONED_EPS * jnp.finfo(S.dtype).eps
@@ -131,21 +175,13 @@ def innovation_info(
         Flag.NO_OBSERVATION: ~jnp.any(valid),
         Flag.NOT_POSITIVE_DEFINITE: ~usable,
         Flag.ILL_CONDITIONED: usable & few_digits,
+        Flag.INDEFINITE: indefinite,
     }
-    if indefinite is not None:
-        raised[Flag.INDEFINITE] = indefinite
     return Info(
         innovation=nu,
         innovation_cov=S,
         log_likelihood=jnp.where(usable, log_likelihood, -jnp.inf),
         nis=nis,
         iterations=jnp.ones((), jnp.int32),
-        flags=_flags(raised),
-    )
-
-
-def _flags(raised: dict[Flag, Array]) -> Array:
-    return sum(
-        (jnp.where(on, int(flag), 0).astype(jnp.int32) for flag, on in raised.items()),
-        jnp.zeros((), jnp.int32),
+        flags=told.flags | flags_of(raised),
     )

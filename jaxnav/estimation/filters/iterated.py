@@ -21,10 +21,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.filters.innovation import (
+    Heard,
+    heard_by,
     innovation_info,
     mask_noise,
     masked_innovation,
-    require_channels,
 )
 from jaxnav.estimation.filters.kalman import KalmanState, ekf
 from jaxnav.estimation.filters.line_search import Search, step_length
@@ -96,16 +97,14 @@ class _Form(NamedTuple):
 
     Attributes:
         base: The filter whose ``init`` and ``predict`` are used.
-        mended: ``(state) -> bool`` whether a covariance was mended in making the state.
         rebuilt: ``(x, P) -> state``.
-        problem: ``(model, params, x, L, u, obs) -> _Problem``.
+        problem: ``(model, params, x, L, u, told) -> _Problem``.
         slope: ``(model, problem, obs, point, search) -> (residual's mean, slope, spread noise)``.
     """
 
     base: Filter
-    mended: Callable[[Any], Array]
     rebuilt: Callable[[Point, Array], Any]
-    problem: Callable[[Model, Params, Point, Array, Input, Obs], _Problem]
+    problem: Callable[[Model, Params, Point, Array, Input, Heard], _Problem]
     slope: Callable[[Model, _Problem, Obs, Array, Search], tuple[Array, Array, Array]]
 
 
@@ -122,7 +121,7 @@ def iterated_ekf(
         Bell and Cathey (1993), IEEE Trans. Automatic Control 38(2).
     """
     base = ekf(model)
-    form = _Form(base, lambda state: jnp.array(False), KalmanState, _additive, _derivative)
+    form = _Form(base, _kalman_state, _additive, _derivative)
     return _iterated(model, form, iterations, trials, search, printed=False)
 
 
@@ -171,7 +170,7 @@ def iterated_ckf(
         (13) and (26) have the wrong sign, and an innovation that is not made anew. All are put
         right here. Arasaratnam and Haykin (2009) for the rule.
     """
-    form = _Form(ckf(model), lambda state: state.indefinite, _sigma_state, _additive, _cubature)
+    form = _Form(ckf(model), _sigma_state, _additive, _cubature)
     return _iterated(model, form, iterations, trials, search, printed)
 
 
@@ -197,7 +196,7 @@ def modified_iterated_ckf(
         Shi, Chen, Wang (2023), Eqs. (19)-(28), with the sizes of (19)-(20) put right and without
         the second ``R`` of (23).
     """
-    form = _Form(ckf(model), lambda state: state.indefinite, _sigma_state, _augmented, _cubature)
+    form = _Form(ckf(model), _sigma_state, _augmented, _cubature)
     return _iterated(model, form, iterations, trials, search, printed)
 
 
@@ -221,7 +220,9 @@ def _iterated(
         prior = form.base.estimate(state)
         whitening = semidefinite_root(prior.cov)
         L = whitening.factor
-        problem = form.problem(model, params.model, prior.mean, L, u, obs)
+        told = heard_by(model, params.model, prior.mean, u, obs)
+        obs = told.obs
+        problem = form.problem(model, params.model, prior.mean, L, u, told)
 
         def iterate(point: Array, _: None) -> tuple[Array, _Step]:
             at = jnp.zeros_like(point) if printed else point
@@ -241,10 +242,10 @@ def _iterated(
         noise = last.slope.R + last.slope.spread_noise
         whitened = left @ left.T + last.gain @ noise @ last.gain.T
         x = model.retract(prior.mean, L @ point[: problem.states])
-        mended = form.mended(state) | ~whitening.semidefinite
+        mended = state.indefinite | ~whitening.semidefinite
         solvable = jnp.all(steps.root.positive_definite)
         judged = first.root._replace(positive_definite=solvable)
-        info = innovation_info(first.slope.innovation, first.S, judged, obs.valid, mended)
+        info = innovation_info(first.slope.innovation, first.S, judged, told, mended)
         taken = jnp.sum(steps.moved).astype(jnp.int32)
         return form.rebuilt(x, symmetrise(L @ whitened @ L.T)), info._replace(iterations=taken)
 
@@ -262,35 +263,40 @@ def _search(params: FilterParams, built_with: Search) -> Search:
     return built_with
 
 
+def _kalman_state(x: Point, P: Array) -> KalmanState:
+    return KalmanState(x, P, jnp.array(False))
+
+
 def _sigma_state(x: Point, P: Array) -> SigmaPointState:
     return SigmaPointState(x, P, (), jnp.array(False))
 
 
-def _additive(model: Model, params: Params, x: Point, L: Array, u: Input, obs: Obs) -> _Problem:
+def _additive(model: Model, params: Params, x: Point, L: Array, u: Input, told: Heard) -> _Problem:
     """Return the update over the state alone."""
-    del obs
     n = L.shape[0]
-    R = model.observation_noise(params, x, u)
     sound = jnp.array(True)
-    return _Problem(lambda at: model.observe(params, model.retract(x, L @ at), u), R, n, n, sound)
+    return _Problem(
+        lambda at: model.observe(params, model.retract(x, L @ at), u), told.noise, n, n, sound
+    )
 
 
-def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input, obs: Obs) -> _Problem:
+def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input, told: Heard) -> _Problem:
     """Return the update over the state and the noise of its observation."""
     n = L.shape[0]
-    require_channels(obs, jax.eval_shape(model.observe, params, x, u).shape)
     if model.noisy is None:
         observe = lambda params, x, v, u: model.observe(params, x, u) + v  # noqa: E731
-        given = mask_noise(model.observation_noise(params, x, u), obs.valid)
+        given = told.noise
     else:
         observe, given = model.noisy.observe, model.noisy.noise(params, x, u)
+        # What is infinite belongs to a channel that is missing.
+        given = jnp.where(jnp.isfinite(given), given, 0)
     root = semidefinite_root(jnp.diag(given) if given.ndim == 1 else given)
     factor = jnp.where(root.semidefinite, root.factor, 0)
 
     def predicted(at: Array) -> Array:
         return observe(params, model.retract(x, L @ at[:n]), factor @ at[n:], u)
 
-    none = jnp.zeros(obs.valid.shape, L.dtype)
+    none = jnp.zeros(told.obs.valid.shape, L.dtype)
     return _Problem(predicted, none, n, n + factor.shape[0], root.semidefinite)
 
 

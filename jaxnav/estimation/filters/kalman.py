@@ -6,6 +6,7 @@ therefore costs what its blocks cost, and nothing in the recursion depends on th
 ``vmap`` over runs computes one covariance for all of them.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,11 +14,12 @@ import jax.numpy as jnp
 from jax import Array
 from jax.ad_checkpoint import checkpoint_name
 
+from jaxnav.estimation.checks import require_filter_params
 from jaxnav.estimation.filters.innovation import (
+    heard,
     innovation_info,
-    mask_noise,
+    is_covariance,
     masked_innovation,
-    require_prior,
     require_step,
 )
 from jaxnav.estimation.filters.linearise import (
@@ -45,10 +47,17 @@ from jaxnav.numerics.linalg import (
 
 
 class KalmanState(NamedTuple):
-    """Mean (a point of the state's manifold) and covariance ``(n, n)``, symmetric to rounding."""
+    """Mean and covariance.
+
+    Attributes:
+        x: A point of the state's manifold.
+        P: ``(n, n)``, symmetric to rounding.
+        indefinite: Whether the prior or the process noise since the last update was no covariance.
+    """
 
     x: Point
     P: Array
+    indefinite: Array
 
 
 def kf(model: Model) -> Filter:
@@ -99,10 +108,11 @@ def ekf(model: Model) -> Filter:
         Zhao, Chen, He, Ge (2018), IEEE/CAA JAS 5(6), section II; Sola, Deray, Atchuthan (2018), A
         micro Lie theory for state estimation in robotics, section III.
     """
+    check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> KalmanState:
-        require_prior(model, params.initial)
-        return KalmanState(*params.initial)
+        check(params)
+        return KalmanState(*params.initial, ~is_covariance(params.initial.cov))
 
     def predict(params: FilterParams, state: KalmanState, u: Input) -> KalmanState:
         n = state.P.shape[0]
@@ -111,36 +121,37 @@ def ekf(model: Model) -> Filter:
         x = jax.lax.optimization_barrier(x)
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
-        return KalmanState(x, symmetrise(push(push(state.P).T)) + Q)
+        indefinite = state.indefinite | jnp.any(jnp.diag(Q) < 0)
+        return KalmanState(x, symmetrise(push(push(state.P).T)) + Q, indefinite)
 
     def update(
         params: FilterParams, state: KalmanState, u: Input, obs: Obs
     ) -> tuple[KalmanState, Info]:
         n = state.P.shape[0]
         z_pred, push = observation_map(model, params.model, state.x, u, n)
+        told = heard(model.observation_noise(params.model, state.x, u), obs)
+        obs, R = told.obs, told.noise
         nu = masked_innovation(model, obs, z_pred)
-        R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         HP = push(state.P)
         S = jnp.where(obs.valid[:, None] & obs.valid[None], push(HP.T), 0) + R
         solution = solved(S, cholesky(S), nu)
         root = solution.root
         # S does not couple valid channels with invalid ones: a zero here is a zero in the gain.
-        heard = jnp.where(obs.valid[:, None] & root.positive_definite, HP, 0)
-        gain = checkpoint_name(solve_positive(root.factor, S, heard), KEPT)
+        B = jnp.where(obs.valid[:, None] & root.positive_definite, HP, 0)
+        gain = checkpoint_name(solve_positive(root.factor, S, B), KEPT)
         HA = push(state.P - matmul(HP.T, gain))
         # What the Joseph form adds is zero but for rounding, whatever the parameters are, and so is
         # its derivative.
         joseph = matmul((matmul(R, gain) - HA).T, gain)
-        P = state.P - explained(S, heard, gain) + jax.lax.stop_gradient(joseph)
-        x = model.retract(state.x, corrected(S, heard, nu, gain, solution.weighed))
-        info = innovation_info(nu, S, root, obs.valid, solution=solution)
-        return KalmanState(x, P), info
+        P = state.P - explained(S, B, gain) + jax.lax.stop_gradient(joseph)
+        x = model.retract(state.x, corrected(S, B, nu, gain, solution.weighed))
+        info = innovation_info(nu, S, root, told, state.indefinite, solution=solution)
+        return KalmanState(x, P, jnp.zeros_like(state.indefinite)), info
 
     def estimate(state: KalmanState) -> Gaussian:
         return Gaussian(state.x, symmetrise(state.P))
 
     def restart(state: KalmanState, given: Gaussian) -> KalmanState:
-        del state
-        return KalmanState(*given)
+        return KalmanState(*given, state.indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)

@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.checks import NOT_NEGATIVE, POSITIVE, require_part
 from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
-from jaxnav.estimation.filters.innovation import masked_innovation, noise_of_channels
+from jaxnav.estimation.filters.innovation import heard_by, masked_innovation
 from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower
 
@@ -76,7 +77,8 @@ def versoria(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
         (2022), as cited by Yang et al. (2025), for the criterion. Both also reweigh the prior,
         which is not done here.
     """
-    return _reweighted(build, model, _versoria_weight, Versoria(), iterations)
+    domains = {"width": NOT_NEGATIVE, "power": POSITIVE}
+    return _reweighted(build, model, _versoria_weight, Versoria(), domains, iterations)
 
 
 def correntropy(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
@@ -88,7 +90,8 @@ def correntropy(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
     References:
         Chen, Liu, Zhao, Principe (2017), Automatica 76, who also reweigh the prior.
     """
-    return _reweighted(build, model, _correntropy_weight, Correntropy(), iterations)
+    domains = {"bandwidth": POSITIVE}
+    return _reweighted(build, model, _correntropy_weight, Correntropy(), domains, iterations)
 
 
 def _versoria_weight(kernel: Versoria, squared: Array) -> Array:
@@ -106,6 +109,7 @@ def _reweighted(
     model: Model,
     weight: Callable[[Any, Array], Array],
     default: Any,
+    domains: dict[str, tuple],
     iterations: int,
 ) -> Filter:
     """Return a filter whose update is made anew with weights from its own residuals.
@@ -118,13 +122,22 @@ def _reweighted(
     require_additive(model, "a robust filter")
     base = build(with_given_noise(model))
 
+    def check(params: FilterParams) -> None:
+        base.check(params)
+        require_part(params, "kernel", type(default), domains)
+
+    def init(params: FilterParams) -> Any:
+        check(params)
+        return base.init(params)
+
     def predict(params: FilterParams, state: Any, u: Input) -> Any:
         return base.predict(given(params, 1.0, 0.0), state, u)
 
     def update(params: FilterParams, state: Any, u: Input, obs: Obs) -> tuple[Any, Info]:
         kernel = default if params.kernel == () else params.kernel
-        R = noise_of_channels(model, params.model, base.estimate(state).mean, u, obs)
-        L = cholesky(R).factor
+        told = heard_by(model, params.model, base.estimate(state).mean, u, obs)
+        obs = told.obs
+        L = cholesky(told.noise).factor
 
         def updated(R: Array, _: None) -> tuple[Array, tuple[Any, Info]]:
             moved, info = base.update(given(params, 1.0, R), state, u, obs)
@@ -134,10 +147,11 @@ def _reweighted(
             return matmul(L / w[None], L.T), (moved, info)
 
         # The plain update and those after it are one body in a loop: a third of it to compile.
-        _, (states, infos) = jax.lax.scan(updated, R, None, length=iterations + 1)
+        _, (states, infos) = jax.lax.scan(updated, told.noise, None, length=iterations + 1)
         moved = jax.tree.map(lambda leaf: leaf[-1], states)
         info = jax.tree.map(lambda leaf: leaf[0], infos)
         flags = jax.lax.reduce(infos.flags, jnp.zeros((), jnp.int32), jax.lax.bitwise_or, (0,))
+        flags = flags | told.flags
         return moved, info._replace(iterations=info.iterations + iterations, flags=flags)
 
-    return base._replace(predict=predict, update=update)
+    return base._replace(init=init, predict=predict, update=update, check=check)

@@ -16,9 +16,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.adaptive import moved_log_factor, softly_clamped
+from jaxnav.estimation.checks import POSITIVE, require_fields, require_part
+from jaxnav.estimation.filters.adaptive import (
+    ADAPTATION_DOMAINS,
+    Adaptation,
+    moved_log_factor,
+    softly_clamped,
+)
 from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
-from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, noise_of_channels
+from jaxnav.estimation.filters.innovation import heard_by, mask_noise, masked_innovation
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower, symmetrise
 
@@ -47,6 +53,15 @@ class SageHusa(NamedTuple):
     high: Array | float = 100.0
     temperature: Array | float = 0.02
     process: Any = ()
+
+
+_DOMAINS = {
+    "forgetting": ("(0, 1]", 0.0, 1.0),
+    "prior_count": ("[0, inf]", 0.0, jnp.inf),
+    "low": POSITIVE,
+    "high": POSITIVE,
+    "temperature": POSITIVE,
+}
 
 
 class SageHusaState(NamedTuple):
@@ -118,7 +133,15 @@ def sage_husa(
     require_additive(model, "a filter that estimates measurement noise")
     base = build(with_given_noise(model))
 
+    def check(params: FilterParams) -> None:
+        base.check(params)
+        require_part(params, "adaptation", SageHusa, _DOMAINS)
+        if isinstance(params.adaptation, SageHusa) and params.adaptation.process != ():
+            process = params.adaptation.process
+            require_fields("process of SageHusa", process, Adaptation, ADAPTATION_DOMAINS)
+
     def init(params: FilterParams) -> SageHusaState:
+        check(params)
         dtype = params.initial.cov.dtype
         unit, none = jnp.eye(channels, dtype=dtype), jnp.zeros((channels,), dtype)
         return SageHusaState(base.init(params), unit, none, jnp.zeros((), dtype))
@@ -131,7 +154,8 @@ def sage_husa(
         params: FilterParams, state: SageHusaState, u: Input, obs: Obs
     ) -> tuple[SageHusaState, Info]:
         own = SageHusa() if params.adaptation == () else params.adaptation
-        nominal = noise_of_channels(model, params.model, base.estimate(state.inner).mean, u, obs)
+        heard_now = heard_by(model, params.model, base.estimate(state.inner).mean, u, obs)
+        obs, nominal = heard_now.obs, heard_now.noise
         root = cholesky(nominal)
         L, scalable = root.factor, root.positive_definite
 
@@ -163,6 +187,7 @@ def sage_husa(
         moved = state.log_factor
         if own.process != ():
             moved = moved_log_factor(own.process, moved, info, obs, smooth=smooth)
+        info = info._replace(flags=info.flags | heard_now.flags)
         samples = state.samples + told.astype(state.samples.dtype)
         return SageHusaState(inner, noise, samples, moved), info
 
@@ -172,7 +197,7 @@ def sage_husa(
     def restart(state: SageHusaState, estimate: Gaussian) -> SageHusaState:
         return state._replace(inner=base.restart(state.inner, estimate))
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
 
 
 def averaging(forgetting: Array | float, count: Array) -> Array:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.checks import require_filter_params
 from jaxnav.estimation.filters.cloud import (
     Cloud,
     centre_column,
@@ -26,10 +27,10 @@ from jaxnav.estimation.filters.cloud import (
     without,
 )
 from jaxnav.estimation.filters.innovation import (
+    heard,
     innovation_info,
-    mask_noise,
+    is_covariance,
     masked_innovation,
-    require_prior,
     require_step,
 )
 from jaxnav.estimation.filters.square_root import read_array
@@ -191,13 +192,14 @@ def square_root_ckf(model: Model) -> Filter:
 
 def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
     """Return the filter in covariance form."""
+    check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> SigmaPointState:
-        require_prior(model, params.initial)
+        check(params)
         rule = _rule(params, rule_of, params.initial.cov.shape[0])
-        root = semidefinite_root(params.initial.cov)
-        points = () if redraw else drawn(rule, root.factor)
-        return SigmaPointState(*params.initial, points, ~root.semidefinite)
+        x, P = params.initial
+        points = () if redraw else drawn(rule, semidefinite_root(P).factor)
+        return SigmaPointState(x, P, points, ~is_covariance(P))
 
     def predict(params: FilterParams, state: SigmaPointState, u: Input) -> SigmaPointState:
         rule = _rule(params, rule_of, state.P.shape[0])
@@ -206,20 +208,21 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
         P = symmetrise(second_moment(rule, cloud, cloud)) + Q
-        mended = state.indefinite | ~root.semidefinite
+        mended = state.indefinite | ~root.semidefinite | jnp.any(jnp.diag(Q) < 0)
         return SigmaPointState(x, P, () if redraw else cloud, mended)
 
     def update(
         params: FilterParams, state: SigmaPointState, u: Input, obs: Obs
     ) -> tuple[SigmaPointState, Info]:
         rule = _rule(params, rule_of, state.P.shape[0])
+        told = heard(model.observation_noise(params.model, state.x, u), obs)
+        obs, R = told.obs, told.noise
         indefinite = state.indefinite
         cloud = state.points
         if redraw:
             root = semidefinite_root(state.P)
             cloud, indefinite = drawn(rule, root.factor), indefinite | ~root.semidefinite
         seen, nu = _observe(model, params, rule, state.x, cloud, u, obs)
-        R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         moments_of = drawn_moments if redraw else moments
         S, cross, left = moments_of(rule, seen, cloud, R)
         factor = cholesky(S)
@@ -228,7 +231,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         gain = jax.lax.optimization_barrier(gain)
         P = left(gain, state.P)
         x = model.retract(state.x, matmul(gain.T, nu))
-        info = innovation_info(nu, S, factor, obs.valid, indefinite)
+        info = innovation_info(nu, S, factor, told, indefinite)
         return SigmaPointState(x, symmetrise(P), state.points, jnp.zeros_like(indefinite)), info
 
     def estimate(state: SigmaPointState) -> Gaussian:
@@ -238,17 +241,18 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         # Points that were kept stay until the next prediction makes them anew.
         return SigmaPointState(given.mean, given.cov, state.points, state.indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
 
 
 def _square_root(model: Model, rule_of: RuleOf) -> Filter:
     """Return the filter in square-root form."""
+    check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> SquareRootSigmaPointState:
-        require_prior(model, params.initial)
+        check(params)
         _rule(params, rule_of, params.initial.cov.shape[0])
-        root = semidefinite_root(params.initial.cov)
-        return SquareRootSigmaPointState(params.initial.mean, root.factor, ~root.semidefinite)
+        x, P = params.initial
+        return SquareRootSigmaPointState(x, semidefinite_root(P).factor, ~is_covariance(P))
 
     def predict(
         params: FilterParams, state: SquareRootSigmaPointState, u: Input
@@ -269,9 +273,10 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         params: FilterParams, state: SquareRootSigmaPointState, u: Input, obs: Obs
     ) -> tuple[SquareRootSigmaPointState, Info]:
         rule = _rule(params, rule_of, state.L.shape[0])
+        told = heard(model.observation_noise(params.model, state.x, u), obs)
+        obs, R = told.obs, told.noise
         seen, nu = _observe(model, params, rule, state.x, drawn(rule, state.L), u, obs)
         seen = halves_of(seen)
-        R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         root, m = semidefinite_root(R).factor, R.shape[0]
         centre = centre_column(rule, seen.centre)
         size = (2 * rule.weight) ** 0.5
@@ -282,7 +287,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         done = read_array(triangle, m, state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         indefinite = state.indefinite | ~sound
-        info = innovation_info(nu, done.S, done.root, obs.valid, indefinite, rooted=True)
+        info = innovation_info(nu, done.S, done.root, told, indefinite, rooted=True)
         return SquareRootSigmaPointState(x, done.L, jnp.zeros_like(indefinite)), info
 
     def estimate(state: SquareRootSigmaPointState) -> Gaussian:
@@ -290,9 +295,10 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
 
     def restart(state: SquareRootSigmaPointState, given: Gaussian) -> SquareRootSigmaPointState:
         root = semidefinite_root(given.cov)
-        return SquareRootSigmaPointState(given.mean, root.factor, ~root.semidefinite)
+        indefinite = state.indefinite | ~root.semidefinite
+        return SquareRootSigmaPointState(given.mean, root.factor, indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
 
 
 def _rule(params: FilterParams, rule_of: RuleOf, n: int) -> SigmaRule:

@@ -1,15 +1,17 @@
 """Square-root twins: the covariance is carried as a triangular factor that cannot go indefinite."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.checks import require_filter_params
 from jaxnav.estimation.filters.innovation import (
+    heard,
     innovation_info,
-    mask_noise,
+    is_covariance,
     masked_innovation,
-    require_prior,
     require_step,
 )
 from jaxnav.estimation.filters.linearise import (
@@ -32,10 +34,17 @@ from jaxnav.numerics.roots import semidefinite_root, tria_beside, tria_of_update
 
 
 class SquareRootState(NamedTuple):
-    """Mean and a lower factor ``L`` ``(n, n)`` of the covariance ``P = L L'``."""
+    """Mean and factor of the covariance.
+
+    Attributes:
+        x: A point of the state's manifold.
+        L: ``(n, n)``, lower, with ``P = L L'``.
+        indefinite: Whether the prior or the process noise since the last update was no covariance.
+    """
 
     x: Point
     L: Array
+    indefinite: Array
 
 
 class ArrayUpdate(NamedTuple):
@@ -62,8 +71,8 @@ def square_root_kf(model: Model) -> Filter:
 
     with ``Theta`` orthogonal. Parameters, offsets and invalid channels are as in
     :func:`~jaxnav.estimation.filters.kalman.kf`, and so are the errors raised. ``P``, ``Q`` and
-    ``R`` may be singular; one that is indefinite loses the columns of its negative pivots, without
-    a flag. Gradients need ``[sqrt(Q), Phi L]`` of full row rank.
+    ``R`` may be singular; one that is indefinite loses the columns of its negative pivots, with a
+    flag. Gradients need ``[sqrt(Q), Phi L]`` of full row rank.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-6 for a
     ratio of measurement to prior sigma of 1e-9 in float64, to 1e-3 for 1e-4 in float32; the
@@ -81,39 +90,44 @@ def square_root_ekf(model: Model) -> Filter:
     The maps ``Phi`` and ``H`` are those of :func:`~jaxnav.estimation.filters.kalman.ekf`. Range
     and rank of the gradients are as for the linear filter.
     """
+    check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> SquareRootState:
-        require_prior(model, params.initial)
-        return SquareRootState(params.initial.mean, semidefinite_root(params.initial.cov).factor)
+        check(params)
+        x, P = params.initial
+        return SquareRootState(x, semidefinite_root(P).factor, ~is_covariance(P))
 
     def predict(params: FilterParams, state: SquareRootState, u: Input) -> SquareRootState:
         x, push = transition_map(model, params.model, state.x, u, state.L.shape[0])
         Q = model.process_noise(params.model, state.x, u)
         require_step(model, state.x, x, Q)
-        noise = semidefinite_root(Q).factor
-        return SquareRootState(x, tria_beside(noise, push(state.L)))
+        noise = semidefinite_root(Q)
+        indefinite = state.indefinite | ~noise.semidefinite
+        return SquareRootState(x, tria_beside(noise.factor, push(state.L)), indefinite)
 
     def update(
         params: FilterParams, state: SquareRootState, u: Input, obs: Obs
     ) -> tuple[SquareRootState, Info]:
         z_pred, push = observation_map(model, params.model, state.x, u, state.L.shape[0])
+        told = heard(model.observation_noise(params.model, state.x, u), obs)
+        obs, R = told.obs, told.noise
         nu = masked_innovation(model, obs, z_pred)
-        R = mask_noise(model.observation_noise(params.model, state.x, u), obs.valid)
         HL = jnp.where(obs.valid[:, None], push(state.L), 0)
         triangle = tria_of_update(semidefinite_root(R).factor, HL, state.L)
         done = read_array(triangle, HL.shape[0], state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
-        info = innovation_info(nu, done.S, done.root, obs.valid, rooted=True)
-        return SquareRootState(x, done.L), info
+        info = innovation_info(nu, done.S, done.root, told, state.indefinite, rooted=True)
+        return SquareRootState(x, done.L, jnp.zeros_like(state.indefinite)), info
 
     def estimate(state: SquareRootState) -> Gaussian:
         return Gaussian(state.x, state.L @ state.L.T)
 
     def restart(state: SquareRootState, given: Gaussian) -> SquareRootState:
-        del state
-        return SquareRootState(given.mean, semidefinite_root(given.cov).factor)
+        root = semidefinite_root(given.cov)
+        indefinite = state.indefinite | ~root.semidefinite
+        return SquareRootState(given.mean, root.factor, indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local)
+    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
 
 
 def read_array(triangle: Array, m: int, predicted: Array) -> ArrayUpdate:

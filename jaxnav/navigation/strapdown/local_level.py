@@ -105,7 +105,7 @@ def mechanise_local_level(
         factor e in about seven minutes.
 
     Raises:
-        ValueError: If ``N`` is not a multiple of ``every``.
+        ValueError: If ``N`` is not a multiple of ``every``, or the position is of 32 bits.
     """
     require_periods(dtheta.shape[0], every)
     gain = jax.vmap(matmul)(jax.vmap(so3_left_jacobian)(dtheta), dvel)

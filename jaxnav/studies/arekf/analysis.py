@@ -11,7 +11,7 @@ from jax import Array
 from jaxnav.compiling import compiled
 from jaxnav.estimation.mismatch import Mismatch, MismatchState, mismatched
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import FilterParams, Gaussian, Obs
+from jaxnav.estimation.types import FilterParams, Gaussian, SureObs
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
@@ -73,7 +73,7 @@ def ratio_map(config: ArekfConfig) -> RatioMap:
             gyro_noise=noise.gyro_noise / factor, accel_noise=noise.accel_noise / factor
         )
         params = Mismatch(FilterParams(believed, prior), FilterParams(noise, prior))
-        nothing = Obs(jnp.zeros(valid.shape), valid)
+        nothing = SureObs(jnp.zeros(valid.shape), valid)
         return run(filter, params, inputs, nothing, record=_norms).record
 
     over_factors = jax.vmap(squares, in_axes=(None, None, 0))

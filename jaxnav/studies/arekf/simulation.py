@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.compiling import host
-from jaxnav.estimation.types import Gaussian, Obs
+from jaxnav.estimation.types import Gaussian, Obs, SureObs
 from jaxnav.navigation.earth import earth_rate, normal_gravity
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
@@ -147,7 +147,7 @@ def fly_run(key: Array, world: World, timing: Timing) -> Run:
         start=seen.start,
         identified=_identified(static_key, world, seen.errors, timing),
         inputs=seen.inputs,
-        fixes=Obs(z, jnp.broadcast_to(arrived[:, None], z.shape)),
+        fixes=SureObs(z, jnp.broadcast_to(arrived[:, None], z.shape)),
         truth=jax.tree.map(lambda leaf: leaf[records], seen.truth),
     )
 

@@ -34,7 +34,7 @@ from jaxnav.estimation.types import (
     FilterParams,
     Gaussian,
     Model,
-    Obs,
+    SureObs,
     WeightRule,
     replicate,
 )
@@ -157,7 +157,7 @@ def run_one(chain_name: str, period: float, imu_step: float, models: int) -> Any
         world, params = shared
         flight = simulate_run(key, world, period, imu_step)
         # One mask for all runs: the covariances may then be shared between them.
-        observations = Obs(flight.z, jnp.ones(world.dcm.shape[:2], bool))
+        observations = SureObs(flight.z, jnp.ones(world.dcm.shape[:2], bool))
         trace = run(comparison, params, flight.inputs, observations, record=_record)
         attitude, weights = trace.record
         rotation, error = attitude_errors(attitude.mean, flight.error[:, LAYOUT.phi], world)

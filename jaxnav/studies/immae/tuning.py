@@ -24,7 +24,7 @@ from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood, rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE, UNIT, above
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs, WeightRule, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, WeightRule, replicate
 from jaxnav.navigation.models.sins_cns import (
     ATTITUDE_LAYOUT,
     LAYOUT,
@@ -81,7 +81,7 @@ def noise_loss(config: ImmaeConfig, key: Array, runs: int) -> Callable[[Array], 
         params = FilterParams(noise_of(config)._replace(noise_scale=factor), initial)
         per_run = jax.vmap(
             lambda z: negative_log_likelihood(
-                filter, params, world.nominal, Obs(z, valid), segment=segment
+                filter, params, world.nominal, SureObs(z, valid), segment=segment
             )
         )
         return jnp.mean(per_run(flights))
@@ -222,7 +222,7 @@ def _rmse(config: ImmaeConfig, smooth: bool, values: Values, flights: Flights) -
     segment = max(1, round(config.steps**0.5))
 
     def one(z: Array, phi: Array) -> dict[str, Array]:
-        observations = Obs(z, valid)
+        observations = SureObs(z, valid)
         return step_means(filter, terms, params, flights.inputs, observations, phi, segment=segment)
 
     means = jax.vmap(one)(flights.z, flights.phi)
@@ -283,7 +283,7 @@ def _comparison(config: ImmaeConfig) -> Callable[[Array, Any], RunOutput]:
     def one(key: Array, shared: tuple[World, BankParams, BankParams]) -> RunOutput:
         world, own, others = shared
         flight = fly(key, world, config.filter_period_s, config.imu_step)
-        observations = Obs(flight.z, jnp.ones(world.dcm.shape[:2], bool))
+        observations = SureObs(flight.z, jnp.ones(world.dcm.shape[:2], bool))
         traces = [
             run(filter, params, flight.inputs, observations, record=attitude).record
             for filter, params in ((tuned[0], own), (tuned[1], own), (rivals, others))

@@ -11,7 +11,7 @@ from jaxnav.estimation.banks.imm import imm
 from jaxnav.estimation.banks.mixture import BankParams, immae, mmae
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf
-from jaxnav.estimation.types import Filter, Obs
+from jaxnav.estimation.types import Filter, SureObs
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
 from jaxnav.studies.mmae_ukf.methods import (
     BANKS,
@@ -51,7 +51,7 @@ def step_costs(config: MmaeUkfConfig) -> dict[str, float]:
     flights = compiled(
         jax.vmap(lambda key: fly(key, world, setup.period, setup.imu_step, setup.star))
     )(keys)
-    observations = Obs(flights.z, jnp.ones(flights.z.shape, bool))
+    observations = SureObs(flights.z, jnp.ones(flights.z.shape, bool))
 
     def timed(name: str, filter: Filter) -> float:
         own = _params(name, shared, config.models)

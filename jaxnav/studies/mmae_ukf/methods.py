@@ -34,7 +34,7 @@ from jaxnav.estimation.types import (
     FilterParams,
     Gaussian,
     Model,
-    Obs,
+    SureObs,
     WeightRule,
     replicate,
 )
@@ -258,7 +258,7 @@ def run_one(setup: Setup, models: int) -> Any:
     def run_methods(key: Array, shared: Shared) -> RunOutput:
         world = shared.world
         flight = fly(key, world, setup.period, setup.imu_step, setup.star)
-        observations = Obs(flight.z, jnp.ones(flight.z.shape, bool))
+        observations = SureObs(flight.z, jnp.ones(flight.z.shape, bool))
         seen = [
             run(filter, started(params, flight.start), flight.inputs, observations, record=record)
             for (filter, record), params in zip(families, shared[1:], strict=True)

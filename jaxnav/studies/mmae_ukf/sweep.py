@@ -13,7 +13,7 @@ from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import StarForm
 from jaxnav.numerics.lie import so3_local
@@ -82,7 +82,7 @@ def _run_one(setup: Setup) -> Any:
     def settled(key: Array, world: World) -> RunOutput:
         flight = fly(key, world, setup.period, setup.imu_step, setup.star)
         initial = Gaussian(flight.start, jnp.diag(world.prior_sigma**2))
-        observations = Obs(flight.z, jnp.ones(flight.z.shape, bool))
+        observations = SureObs(flight.z, jnp.ones(flight.z.shape, bool))
 
         def last_outside(filter: Filter) -> Array:
             params = FilterParams(world.noise, initial)

@@ -18,7 +18,7 @@ from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE, above
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs, WeightRule, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, WeightRule, replicate
 from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import SinsTotal, SinsTotalInput
 from jaxnav.numerics.lie import so3_local
@@ -187,7 +187,7 @@ def _rmse(config: MmaeUkfConfig, filter: Filter, values: Values, flights: Flight
 
     def one(flight: Flights) -> dict[str, Array]:
         params = BankParams(_members(config, sigma, values, flight.start), ((), _reset(config)))
-        observations = Obs(flight.z, jnp.ones(flight.z.shape, bool))
+        observations = SureObs(flight.z, jnp.ones(flight.z.shape, bool))
         truth = (flight.dcm, counted)
         segment = max(1, round(steps**0.5))
         return step_means(
@@ -220,7 +220,7 @@ def _comparison(setup: Setup) -> Callable[[Array, Any], RunOutput]:
         count = own.members.sigma.spread.shape[0]
         initial = own.members.initial._replace(mean=replicate(flight.start, count))
         params = own._replace(members=own.members._replace(initial=initial))
-        observations = Obs(flight.z, jnp.ones(flight.z.shape, bool))
+        observations = SureObs(flight.z, jnp.ones(flight.z.shape, bool))
 
         def scores(filter: Filter, params: BankParams) -> dict[str, Array]:
             seen = run(filter, params, flight.inputs, observations, record=_attitudes).record

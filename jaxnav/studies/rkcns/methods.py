@@ -17,7 +17,7 @@ from jaxnav.estimation.filters.sigma_point import ckf
 from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.montecarlo import RunOutput
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs, SureObs
 from jaxnav.navigation.atmosphere import RefractionTable
 from jaxnav.navigation.earth import MEAN_RADIUS
 from jaxnav.navigation.limb import HeightModel, exponential_model, fitted_model
@@ -161,15 +161,15 @@ def problem_of(name: str, flight: Run, shared: Shared) -> tuple[FilterParams, An
     z, valid, start = flight.z, flight.valid, flight.start
     if name == "conventional":
         params = FilterParams(shared.world.noise, start)
-        return params, flight.conventional, Obs(z[:, :3], valid[:, :3])
+        return params, flight.conventional, SureObs(z[:, :3], valid[:, :3])
     inputs = flight.limb
     if name == "oracle":
         inputs = inputs._replace(density=flight.density * jnp.ones_like(inputs.density))
     if name in ("oracle", "angle-ckf"):
         angles = z.at[:, 3:-3].set(inputs.angle)
-        return FilterParams(shared.exact, start), inputs, Obs(angles, valid)
+        return FilterParams(shared.exact, start), inputs, SureObs(angles, valid)
     search = shared.search if "iterated" in name else ()
-    return FilterParams(shared.limb, start, search=search), inputs, Obs(z, valid)
+    return FilterParams(shared.limb, start, search=search), inputs, SureObs(z, valid)
 
 
 @cache

@@ -11,7 +11,7 @@ from jaxnav.compiling import compiled, host
 from jaxnav.datasets.stars import load_stars
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import FilterParams, Gaussian, Obs
+from jaxnav.estimation.types import FilterParams, Gaussian, SureObs
 from jaxnav.navigation.atmosphere import RefractionTable, tabulate
 from jaxnav.navigation.earth import MEAN_RADIUS
 from jaxnav.navigation.limb import seen_refraction
@@ -307,7 +307,7 @@ def _dead_reckoned(
     inputs = SinsTotalInput(dtheta, dvel, jnp.ones(steps, error0.dtype))
     unaided = ekf(sins_total(timing.launch_period, timing.imu_step, MEAN_RADIUS))
     params = FilterParams(world.noise, Gaussian(believed, jnp.diag(world.prior_sigma**2)))
-    nothing = Obs(jnp.zeros((steps, 3), error0.dtype), jnp.zeros((steps, 3), bool))
+    nothing = SureObs(jnp.zeros((steps, 3), error0.dtype), jnp.zeros((steps, 3), bool))
     final = run(unaided, params, inputs, nothing, record=lambda state, info: ()).final
     return unaided.estimate(final)
 

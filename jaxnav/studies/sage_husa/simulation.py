@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.compiling import host
-from jaxnav.estimation.types import Gaussian, Model, Obs, seeing
+from jaxnav.estimation.types import Gaussian, Model, Obs, SureObs, seeing
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
@@ -157,4 +157,4 @@ def drive_run(key: Array, world: World, clock: Clock) -> Run:
     offset = jnp.pad(white * world.added[:, None], ((0, 0), (0, 1)))
     z = jnp.concatenate([z[:, :3], jax.vmap(displaced)(z[:, 3:], offset)], axis=1)
     inputs = DriveInput(seen.inputs, world.added)
-    return Run(seen.start, inputs, Obs(z, jnp.ones(z.shape, bool)), seen.truth)
+    return Run(seen.start, inputs, SureObs(z, jnp.ones(z.shape, bool)), seen.truth)

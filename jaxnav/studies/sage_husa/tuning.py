@@ -23,7 +23,7 @@ from jaxnav.estimation.types import (
     FilterParams,
     Gaussian,
     Info,
-    Obs,
+    SureObs,
     WeightRule,
     replicate,
 )
@@ -255,7 +255,7 @@ def rule_rmse(smooth: bool, values: Values, watched: Watched) -> Array:
 def _mean_square(rule: WeightRule, params: Any, log_prior: Array, watched: Watched) -> Array:
     """Return the mean over a drive of the square of the position's error, east and north [m^2]."""
     steps = watched.error.shape[0]
-    silent = Obs(jnp.zeros((steps, 0)), jnp.zeros((steps, 0), bool))
+    silent = SureObs(jnp.zeros((steps, 0)), jnp.zeros((steps, 0), bool))
     own = BankParams((), params, log_prior)
     segment = max(1, round(steps**0.5))
     weights = run(rewatch(rule), own, watched.info, silent, record=_told, segment=segment).record

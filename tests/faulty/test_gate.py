@@ -1,0 +1,127 @@
+"""The gate: what contradicts the filter is refused, what goes on doing so is let in."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxnav as jn
+from jaxnav.compiling import compiled
+from jaxnav.estimation.filters.gated import Gate, Gated, gated
+from jaxnav.estimation.types import Flag
+
+STEPS = 400
+DT = 0.2
+GROUPS = ((0, 1), (2, 3))
+"""Positions and velocities."""
+
+F = np.kron([[1.0, DT], [0.0, 1.0]], np.eye(2))
+Q = 0.04 * np.kron([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]], np.eye(2))
+SIGMA = np.array([0.5, 0.5, 0.1, 0.1])
+MODEL = jn.Model(
+    transition=lambda p, x, u: jnp.asarray(F) @ x,
+    process_noise=lambda p, x, u: jnp.asarray(Q),
+    observe=lambda p, x, u: x,
+    observation_noise=lambda p, x, u: p * jnp.asarray(SIGMA**2),
+)
+PRIOR = jn.FilterParams(jnp.array(1.0), jn.Gaussian(jnp.zeros(4), jnp.eye(4)))
+BANK = jn.BankParams(jn.replicate(PRIOR, 2)._replace(model=jnp.array([1.0, 4.0])), ())
+FILTERS = {
+    "kf": (jn.kf(MODEL), PRIOR),
+    "bank": (jn.mmae(jn.kf(MODEL)), BANK),
+}
+GATES = {name: gated(filter, GROUPS) for name, (filter, _) in FILTERS.items()}
+
+
+def flight() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(3)
+    x, states = np.array([0.0, 0.0, 3.0, 1.0]), []
+    root = np.linalg.cholesky(Q)
+    for _ in range(STEPS):
+        x = F @ x + root @ rng.normal(size=4)
+        states.append(x)
+    truth = np.array(states)
+    return truth, truth + SIGMA * rng.normal(size=truth.shape)
+
+
+TRUTH, Z = flight()
+
+
+def ran(name: str, z: np.ndarray, gate: Gate | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return means ``(T, 4)`` and flags ``(T,)``."""
+    numbers = jax.tree.map(jnp.asarray, gate or Gate())
+    estimate, info = jn.run(
+        GATES[name],
+        Gated(FILTERS[name][1], numbers),
+        jnp.zeros((STEPS, 1)),
+        jn.Obs(jnp.asarray(z), jnp.ones(z.shape, bool)),
+    ).record
+    return np.asarray(estimate.mean), np.asarray(info.flags)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_clean_log_passes_and_is_what_it_was(name: str) -> None:
+    filter, params = FILTERS[name]
+    obs = jn.Obs(jnp.asarray(Z), jnp.ones(Z.shape, bool))
+    plain = jn.run(filter, params, jnp.zeros((STEPS, 1)), obs).record[0].mean
+    mean, flags = ran(name, Z)
+    assert not np.any(flags & (Flag.REFUSED | Flag.REOPENED))
+    np.testing.assert_allclose(mean, plain, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("off", [20.0, 100.0, 1.1e3, 1.6e5])
+def test_one_fix_that_is_off_changes_nothing(name: str, off: float) -> None:
+    clean, _ = ran(name, Z)
+    for step in (50, 200, STEPS - 2):
+        z = Z.copy()
+        z[step, 0] += off
+        mean, flags = ran(name, z)
+        np.testing.assert_array_equal(np.flatnonzero(flags & Flag.REFUSED), [step])
+        assert np.max(np.abs(mean - clean)[:, :2]) < 0.5
+        # the velocities of that fix are another group, and were used
+        assert not flags[step] & Flag.NO_OBSERVATION
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_what_goes_on_contradicting_is_let_in(name: str) -> None:
+    """The vehicle is carried away while the receiver is silent: the filter was wrong."""
+    for jump, within in ((10.0, 40), (1e3, 90)):
+        z = Z.copy()
+        z[150:, 0] += jump
+        mean, flags = ran(name, z)
+        refused = np.flatnonzero(flags & Flag.REFUSED)
+        assert refused[0] == 150
+        assert refused[-1] < 150 + within
+        again = np.flatnonzero(flags & Flag.REOPENED)
+        assert len(again) >= 1
+        late = slice(refused[-1] + 20, None)
+        assert np.max(np.abs(mean - TRUTH - [jump, 0, 0, 0])[late, :2]) < 5 * SIGMA[0]
+
+
+def test_patience_and_probability_are_parameters() -> None:
+    z = Z.copy()
+    z[150:, 0] += 10.0
+    _, never = ran("kf", z, Gate(patience=jnp.inf))
+    assert np.all(never[150:] & Flag.REFUSED)
+    _, strict = ran("kf", Z, Gate(probability=0.9))
+    share = np.mean((strict & Flag.REFUSED) > 0)
+    assert 0.1 < share < 0.3
+
+    @compiled
+    def score(patience: Any) -> Any:
+        params = Gated(PRIOR, Gate(patience=patience))
+        obs = jn.Obs(jnp.asarray(z), jnp.ones(z.shape, bool))
+        return jn.negative_log_likelihood(GATES["kf"], params, jnp.zeros((STEPS, 1)), obs)
+
+    assert np.isfinite(jax.grad(score)(jnp.array(5.0)))
+
+
+def test_groups_are_apart_and_parameters_are_its_own() -> None:
+    with pytest.raises(ValueError, match="a channel can be in one group only"):
+        gated(FILTERS["kf"][0], ((0, 1), (1, 2)))
+    obs = jn.Obs(jnp.asarray(Z), jnp.ones(Z.shape, bool))
+    with pytest.raises(ValueError, match=r"^params is a FilterParams; a gated filter takes Gated"):
+        jn.run(GATES["kf"], PRIOR, jnp.zeros((STEPS, 1)), obs)
