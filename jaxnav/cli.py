@@ -14,7 +14,7 @@ from jaxnav.datasets.base import DataError
 from jaxnav.studies import STUDIES
 from jaxnav.studies.base import ConfigError, StudyResult, require_x64
 
-OK, BAD_INPUT, DIVERGED, INTERRUPTED = 0, 2, 3, 130
+OK, BAD_INPUT, DIVERGED, FAULT, INTERRUPTED = 0, 2, 3, 4, 130
 
 USAGE = """\
 usage: jaxnav COMMAND [options]
@@ -31,7 +31,7 @@ commands:
 
 `jaxnav --version` prints the version.
 
-exit codes: 0 done, 2 bad input, 3 some runs diverged, 130 interrupted
+exit codes: 0 done, 2 bad input, 3 some runs diverged, 4 a fault under --strict, 130 interrupted
 """
 
 
@@ -236,7 +236,9 @@ def _filter(rest: list[str]) -> int:
         print_document(finite_or_null(report.document))
     else:
         print_filter(report.document, directory, figures)
-    return DIVERGED if report.document["diverged"] else OK
+    if report.document["diverged"]:
+        return DIVERGED
+    return FAULT if parsed.config.strict and report.document["faults"] else OK
 
 
 def _allan(rest: list[str]) -> int:

@@ -15,6 +15,8 @@ from jaxnav.results import summary
 from jaxnav.studies import STUDIES
 from jaxnav.studies.base import Claim, StudyResult
 
+SHOWN = 8
+"""Refused fixes that are named on the screen; ``summary.json`` names all."""
 NOT_SHOWN = ("anees_dof", "log_likelihood_se")
 """Measures of a method that the table leaves to ``summary.json``."""
 
@@ -277,12 +279,34 @@ def print_filter(document: dict[str, Any], directory: Path, figures: list[Path])
         soft_wrap=True,
     )
     within = run["nis_within"]
+    told = ", ".join(
+        f"{finding['name'].removeprefix('NIS, ')} {finding['verdict']}"
+        for finding in document["audit"]
+        if finding["name"].startswith("NIS, ") and finding["verdict"] != "not seen"
+    )
     console.print(
         f"log-likelihood {run['log_likelihood']:.1f}; NIS per channel "
-        f"{run['nis_per_channel']:.3g}, {within['share']:.1%} of fixes within the "
-        f"{within['confidence']:.0%} bound",
+        f"{run['nis_per_channel']:.3g} ({told or 'not judged'}), {within['share']:.1%} of fixes "
+        f"within the {within['confidence']:.0%} bound",
         soft_wrap=True,
     )
+    turned = ", ".join(f"{angle:.2f}" for angle in start["mounting_deg"])
+    console.print(f"mounting {start['mounting']}: {turned} deg", soft_wrap=True)
+    for finding in document["audit"]:
+        if finding["verdict"] in ("doubt", "fault"):
+            colour = "red" if finding["verdict"] == "fault" else "yellow"
+            console.print(
+                f"[{colour}]{finding['verdict']}: {escape(finding['says'])}", soft_wrap=True
+            )
+    if document["refused"]:
+        shown = ", ".join(
+            f"{entry['fix']} ({entry['time_s']:.6g} s)" for entry in document["refused"][:SHOWN]
+        )
+        more = len(document["refused"]) - SHOWN
+        console.print(
+            f"[yellow]refused: fix {shown}{f' and {more} more' if more > 0 else ''}",
+            soft_wrap=True,
+        )
     if document["reference"]:
         console.print(_reference_table(document["reference"]))
     if document["outages"]:

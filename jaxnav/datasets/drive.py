@@ -63,7 +63,7 @@ def checked(log: DriveLog) -> DriveLog:
     """
     fixes = log.fixes
     try:
-        check_fixes(fixes.time_ns, fixes.geodetic, fixes.velocity)
+        check_fixes(fixes.time_ns, fixes.geodetic, fixes.velocity, fixes.position_sigma)
         _check_sigmas("position", fixes.position_sigma)
         if fixes.velocity_sigma is not None:
             _check_sigmas("velocity", fixes.velocity_sigma)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from jaxnav.datasets.drive import DriveLog, checked
 from jaxnav.datasets.inertial import SENSOR_UNITS, assemble
 from jaxnav.datasets.table import ANGLE, LENGTH, SPEED, Table, Units, read_table
-from jaxnav.datasets.track import GnssTrack, Sigmas, without_repeats
+from jaxnav.datasets.track import GnssTrack, Sigmas, with_solution, without_repeats
 
 PLACE = ("lat", "lon", "height")
 VELOCITY = ("vel_e", "vel_n", "vel_u")
@@ -68,7 +68,7 @@ def load_drive_csv(
             fixes=_fixes(table, fixed, sigmas or Sigmas(), str(path)),
             lever_arm=np.array(lever_arm, dtype=np.float64),
             reference=None,
-            skipped_rows=int(np.sum(~sampled & ~fixed)),
+            skipped_rows=int(np.sum(~sampled & ~fixed)) + table.cut,
             source=str(path),
         )
     )
@@ -91,7 +91,7 @@ def _fixes(table: Table, fixed: NDArray[np.bool_], sigmas: Sigmas, source: str) 
         source=source,
         duplicates=0,
     )
-    return without_repeats(track)
+    return without_repeats(with_solution(track))
 
 
 def _stack(table: Table, names: tuple[str, ...]) -> NDArray[np.float64]:

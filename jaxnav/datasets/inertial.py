@@ -25,6 +25,8 @@ COLUMNS = ("time", *SENSORS)
 SENSOR_UNITS: Units = {name: RATE if name.startswith("gyro") else FORCE for name in SENSORS}
 GAP = 1.5
 """Intervals above so many median intervals are gaps."""
+REPEATED = 0.05
+"""Share of samples that may repeat a time: a logger that wrote some of them twice."""
 SPARSEST = 100
 """Samples of a regular grid for each sample of the log, at most."""
 
@@ -88,14 +90,20 @@ def assemble(time_ns: NDArray[np.int64], values: NDArray[np.float64], source: st
         source: Path of the file.
 
     Raises:
-        DataError: If a time goes backwards, fewer than two samples are left, or they are
-            implausible (:func:`check_plausible`).
+        DataError: If a time goes backwards, many repeat the one before, fewer than two samples are
+            left, or they are implausible (:func:`check_plausible`).
     """
     steps = np.diff(time_ns, prepend=time_ns[:1] - 1)
     if np.any(steps < 0):
         raise DataError(
             f"{source}: the time of sample {np.argmax(steps < 0) + 1} is before that of the "
             "previous one; accepted are times that do not decrease"
+        )
+    repeats = float(np.mean(steps == 0)) if len(steps) else 0.0
+    if repeats > REPEATED:
+        raise DataError(
+            f"{source}: {repeats:.0%} of the samples repeat the time of the one before: their "
+            "stamps are too coarse for the rate; accepted are stamps that tell samples apart"
         )
     time_ns, values = time_ns[steps > 0], values[steps > 0]
     if len(time_ns) < 2:

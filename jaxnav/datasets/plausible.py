@@ -52,19 +52,22 @@ def check_fixes(
     time_ns: NDArray[np.int64],
     geodetic: NDArray[np.float64],
     velocity: NDArray[np.float64] | None,
+    sigma: NDArray[np.float64] | None = None,
 ) -> None:
     """Refuse fixes that are on no place of the Earth, or whose numbers betray a wrong unit.
 
     * Latitude beyond a quarter turn, longitude beyond half a turn, height below -1 km or above
       100 km.
-    * Over stretches of ten seconds with more than 30 m of way, ``s . d / max(|s|, |d|)^2`` below a
-      half in the median, ``s`` being the integral of the velocity and ``d`` the change of the
-      position: a velocity, a position or the time in another unit, or axes in another order.
+    * Over stretches of ten seconds with more way than 30 m and ten times the noise,
+      ``s . d / max(|s|, |d|)^2`` below a half in the median, ``s`` being the integral of the
+      velocity and ``d`` the change of the position: a velocity, a position or the time in another
+      unit, or axes in another order.
 
     Args:
         time_ns: ``(T,) [ns]``.
         geodetic: Latitude, longitude [rad], height [m], ``(T, 3)``.
         velocity: East, north, up ``(T, 3) [m/s]``, NaN where not known; ``None`` if nowhere.
+        sigma: Standard deviations of the positions ``(T, 3) [m]``; ``None`` is no noise.
 
     Raises:
         DataError: With what the fixes look like.
@@ -83,11 +86,15 @@ def check_fixes(
                 f"from {low:.6g} to {high:.6g} {unit}"
             )
     if velocity is not None:
-        _check_way(time_ns, geodetic, velocity[:, :2])
+        noise = 0.0 if sigma is None else float(np.nanmedian(sigma[:, :2]))
+        _check_way(time_ns, geodetic, velocity[:, :2], max(_FAR, 10 * noise))
 
 
 def _check_way(
-    time_ns: NDArray[np.int64], geodetic: NDArray[np.float64], velocity: NDArray[np.float64]
+    time_ns: NDArray[np.int64],
+    geodetic: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    least: float,
 ) -> None:
     known = np.isfinite(velocity).all(axis=1)
     time, place, velocity = (time_ns[known] - time_ns[0]) / 1e9, geodetic[known], velocity[known]
@@ -101,7 +108,7 @@ def _check_way(
     turn = np.remainder(place[end] - place[begin] + np.pi, 2 * np.pi) - np.pi
     moved = MEAN_RADIUS * np.stack([turn[:, 1] * np.cos(place[begin, 0]), turn[:, 0]], axis=1)
     lengths = np.stack([np.linalg.norm(told, axis=1), np.linalg.norm(moved, axis=1)])
-    far = lengths.max(axis=0) > _FAR
+    far = lengths.max(axis=0) > least
     if not far.any():
         return
     if np.median((np.sum(told * moved, axis=1) / lengths.max(axis=0) ** 2)[far]) < 0.5:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxnav.datasets.base import DataError, number, read_text
-from jaxnav.datasets.track import GnssTrack, without_repeats
+from jaxnav.datasets.track import GnssTrack, with_solution, without_repeats
 
 _EPOCH = datetime(1970, 1, 1)
 _GPS_EPOCH = datetime(1980, 1, 6)
@@ -72,6 +72,9 @@ def load_rtklib_pos(path: str | Path) -> GnssTrack:
         source=str(path),
         duplicates=0,
     )
+    track = with_solution(track, track.quality != 0)
+    if not len(track.time_ns):
+        raise DataError(f"{path}: no fix has a solution (Q is 0 in all); accepted is at least one")
     return without_repeats(track)
 
 

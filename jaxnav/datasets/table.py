@@ -40,10 +40,12 @@ class Table(NamedTuple):
         time_ns: ``(N,) [ns]``, not decreasing.
         columns: The entries ``(N,)`` of each column that was asked for and is there, in SI units;
             NaN or infinite where not known.
+        cut: Whether the last line ends early, as of a logger that was switched off; it is left out.
     """
 
     time_ns: NDArray[np.int64]
     columns: dict[str, NDArray[np.float64]]
+    cut: bool = False
 
 
 class _Column(NamedTuple):
@@ -74,7 +76,8 @@ def read_table(
     needed = ("time", *units)
     layout: list[_Column] = []
     width, times, rows = 0, [], []
-    for line, text in enumerate(read_text(path, accepted).split("\n"), start=1):
+    lines, cut = _whole_lines(read_text(path, accepted))
+    for line, text in enumerate(lines, start=1):
         if not text.strip() or text.startswith("#"):
             continue
         fields = [field.strip() for field in text.split(",")]
@@ -93,7 +96,17 @@ def read_table(
     return Table(
         np.array(times, dtype=np.int64),
         {column.name: values * known[column.name][column.unit] for column, values in columns},
+        cut,
     )
+
+
+def _whole_lines(text: str) -> tuple[list[str], bool]:
+    """Return the lines of a file, without a last one that has no end and fewer columns."""
+    lines = text.split("\n")
+    last = lines[-1]
+    before = [line for line in lines[-3:-1] if line.strip() and not line.startswith("#")]
+    cut = bool(last.strip() and before and last.count(",") < before[-1].count(","))
+    return (lines[:-1] if cut else lines), cut
 
 
 def entry(name: str, text: str) -> float:

@@ -26,6 +26,7 @@ class GnssTrack(NamedTuple):
             6 precise point positioning; 0 where the log does not say.
         source: Path of the file.
         duplicates: Fixes of the file dropped because they repeat the time before.
+        unsolved: Fixes of the file dropped because the receiver had no solution.
     """
 
     time_ns: NDArray[np.int64]
@@ -36,6 +37,7 @@ class GnssTrack(NamedTuple):
     quality: NDArray[np.int64]
     source: str
     duplicates: int
+    unsolved: int = 0
 
 
 class Sigmas(NamedTuple):
@@ -72,6 +74,21 @@ def without_repeats(track: GnssTrack) -> GnssTrack:
     fresh = np.flatnonzero(np.concatenate([[1], steps])[: len(track.time_ns)])
     dropped = len(track.time_ns) - len(fresh)
     return _take(track, fresh)._replace(duplicates=track.duplicates + dropped)
+
+
+def with_solution(track: GnssTrack, solved: NDArray[np.bool_] | None = None) -> GnssTrack:
+    """Return the log without the fixes of a receiver that had no solution, counted.
+
+    A latitude and a longitude of exactly zero are such a fix whatever the log says of it.
+
+    Args:
+        track: The log as read.
+        solved: ``(T,)`` which fixes the log calls one; ``None`` if it does not say.
+    """
+    null = np.all(track.geodetic[:, :2] == 0, axis=1)
+    kept = ~null if solved is None else solved & ~null
+    dropped = int(np.sum(~kept))
+    return _take(track, np.flatnonzero(kept))._replace(unsolved=track.unsolved + dropped)
 
 
 def thin(track: GnssTrack, period_s: float) -> GnssTrack:

@@ -10,7 +10,9 @@ from scipy.stats import chi2
 
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.run import run
+from jaxnav.estimation.types import Flag
 from jaxnav.navigation.models.vehicle import FIXES
+from jaxnav.recorded import audit
 from jaxnav.recorded.config import FilterConfig, check, members
 from jaxnav.recorded.experiments import (
     NoiseScores,
@@ -103,6 +105,7 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         tell("added noise", 1, 1)
     if lost:
         notes.append("a run with fixes hidden diverged")
+    findings = audit.audit(log, drive, kept)
     off = fix_errors(chosen.model, single_model(params), drive, kept.mean)
     names = member_names(config) if members(config) > 1 else []
     document = {
@@ -115,6 +118,9 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         "time_offset": _offset(config, offset),
         "members": names,
         "filter": _filter_scores(drive, kept, off),
+        "audit": audit.document(findings),
+        "faults": audit.faults(findings),
+        "refused": _refused(log, drive, kept),
         "diverged": diverged(kept, drive) or lost,
         "reference": reference and _reference_scores(reference),
         "outages": outages and _outage_scores(outages, config),
@@ -159,6 +165,7 @@ def _counts(log: DriveLog, drive: Drive) -> dict[str, Any]:
         "skipped_rows": log.skipped_rows,
         "fixes": len(log.fixes.time_ns),
         "fix_duplicates": log.fixes.duplicates,
+        "fixes_without_solution": log.fixes.unsolved,
         "fixes_used": len(drive.fix),
         "fixes_unused": drive.unused,
         "fixes_not_fixed": int(np.sum(log.fixes.quality != FIXED)),
@@ -168,6 +175,14 @@ def _counts(log: DriveLog, drive: Drive) -> dict[str, Any]:
         "stopped_periods": int(np.sum(drive.stopped)),
         "constraint_updates": int(np.sum(valid[:, FIXES.stop :].any(axis=1))),
     }
+
+
+def _refused(log: DriveLog, drive: Drive, kept: Kept) -> list[dict[str, Any]]:
+    """Return the fixes that the gate refused: their number in the log, from 1, and their time."""
+    flags = np.asarray(kept.flags)[drive.fix_step]
+    refused = np.flatnonzero(flags & Flag.REFUSED)
+    since = (log.fixes.time_ns - log.imu.time_ns[0]) / 1e9
+    return [{"fix": int(drive.fix[i]) + 1, "time_s": float(since[drive.fix[i]])} for i in refused]
 
 
 def _alignment(drive: Drive, config: FilterConfig, turned: np.ndarray) -> dict[str, Any]:
@@ -269,5 +284,5 @@ def _notes(log: DriveLog, drive: Drive, config: FilterConfig, offset: Offset | N
     if drive.bridged_s > 5 * log.imu.step_s:
         notes.append(f"inertial samples are missing for up to {drive.bridged_s:.3g} s")
     if config.constraints and config.mounting_deg is None:
-        notes.append("the mounting angles are from the fixes of the first minute")
+        notes.append("the mounting angles are from a run without the constraints")
     return notes

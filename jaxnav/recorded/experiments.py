@@ -13,6 +13,7 @@ from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.banks.mixture import BankParams, panel
 from jaxnav.estimation.banks.weights import Penalty, bayes, chain, fixed, floor, penalty
+from jaxnav.estimation.filters.gated import Gated
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sage_husa import sage_husa
 from jaxnav.estimation.run import run
@@ -20,7 +21,7 @@ from jaxnav.estimation.types import Filter, FilterParams, Obs, WeightRule, repli
 from jaxnav.navigation.earth import WGS84, metres_per_radian
 from jaxnav.navigation.models.level_errors import SinsLevel, error_form
 from jaxnav.navigation.models.vehicle import FIXES, vehicle
-from jaxnav.recorded.config import FilterConfig
+from jaxnav.recorded.config import ALONE, FilterConfig
 from jaxnav.recorded.methods import Kept, Method, filter_params, sage_husa_params
 from jaxnav.recorded.preparation import Drive, prepare
 from jaxnav.recorded.scoring import MOUNTING_S, fix_errors, horizontal
@@ -131,8 +132,10 @@ def hide_and_score(
     return Outages(start[in_window[last]], since, in_window, errors, at_end), runs
 
 
-def single_model(params: FilterParams | BankParams) -> Any:
+def single_model(params: FilterParams | BankParams | Gated) -> Any:
     """Return the model's parameters of a filter, or of the first member of a bank."""
+    if isinstance(params, Gated):
+        return single_model(params.inner)
     if isinstance(params, BankParams):
         return jax.tree.map(lambda leaf: leaf[0], params.members.model)
     return params.model
@@ -160,7 +163,7 @@ def add_noise(log: DriveLog, config: FilterConfig) -> NoiseScores:
     References:
         Song et al. (2022), Sensors 22:5976, Table 3 and Eqs. (26)-(27): noise of 6 m and 9 m.
     """
-    plain = replace(config, filter="ekf", constraints=False, r_factors=(1.0,), q_factors=(1.0,))
+    plain = replace(config, **ALONE)
     drive = prepare(log, plain, config.noise_rate_hz)
     origin = drive.initial.mean.position
     model, form = vehicle(constrained=False), error_form("additive", origin)

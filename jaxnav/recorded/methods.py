@@ -21,6 +21,7 @@ from jaxnav.estimation.banks.weights import (
     penalty,
 )
 from jaxnav.estimation.filters.adaptive import innovation_adaptive
+from jaxnav.estimation.filters.gated import Gate, Gated, gated
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.robust import versoria
 from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
@@ -38,6 +39,7 @@ from jaxnav.estimation.types import (
 from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
+from jaxnav.numerics.linalg import cholesky, solve_lower
 from jaxnav.recorded.config import FilterConfig, members
 from jaxnav.recorded.preparation import CHANNELS, Drive
 from jaxnav.units import DEG, GRAVITY
@@ -47,11 +49,15 @@ NOISE_RANGE = (0.1, 1e6)
 """Variance over the nominal that a Sage-Husa filter may estimate: RTK to hundreds of metres."""
 
 
+RECEIVER = ((0, 1, 2), (3, 4, 5))
+"""The channels of a fix that a gate takes together: its velocity, its position."""
+
+
 class Method(NamedTuple):
     """A filter or bank with its model.
 
     Attributes:
-        filter: What runs.
+        filter: What runs, behind its gate if it has one.
         model: The model of a member.
         form: The definition of its error.
         record: What a run keeps of a step: a :class:`Kept`.
@@ -73,6 +79,9 @@ class Kept(NamedTuple):
         sigma: ``(15,)`` standard deviations in additive errors.
         nis: Normalised innovation squared.
         log_likelihood: Of the step.
+        group_nis: ``(3,)`` the same of velocities, positions and constraints alone.
+        channels: ``(3,)`` how many of each were used.
+        flags: Sum of :class:`~jaxnav.estimation.types.Flag`.
         innovation: ``(6,)`` of the receiver's channels.
         innovation_sigma: ``(6,)`` what the filter expects.
         weights: ``(M,)`` of the members of a bank; ``(0,)`` of a filter.
@@ -81,6 +90,9 @@ class Kept(NamedTuple):
     mean: SinsLevel
     sigma: Array
     nis: Array
+    group_nis: Array
+    channels: Array
+    flags: Array
     log_likelihood: Array
     innovation: Array
     innovation_sigma: Array
@@ -101,15 +113,22 @@ def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> 
     one, form = member(config, model, channels), error_form(error, origin)
     banked = members(config) > 1
     chosen = bank(one, rule(config)) if banked else one
+    if config.gate:
+        chosen = gated(chosen, RECEIVER)
 
     def record(state: Any, info: Info) -> Kept:
         estimate = chosen.estimate(state)
-        weights = jnp.exp(state.log_weights) if banked else jnp.zeros(0)
+        own = state.inner if config.gate else state
+        weights = jnp.exp(own.log_weights) if banked else jnp.zeros(0)
         seen = jnp.diag(info.innovation_cov)[FIXES]
+        group_nis, used = by_group(info)
         return Kept(
             estimate.mean,
             additive_sigma(form, estimate),
             info.nis,
+            group_nis,
+            used,
+            info.flags,
             info.log_likelihood,
             info.innovation[FIXES],
             jnp.sqrt(seen),
@@ -117,6 +136,25 @@ def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> 
         )
 
     return Method(chosen, model, form, record, banked)
+
+
+def by_group(info: Info) -> tuple[Array, Array]:
+    """Return the NIS of velocities, positions and constraints ``(3,)``, and channels of each."""
+    count = info.innovation.shape[0]
+    groups = (*RECEIVER, tuple(range(FIXES.stop, count)))
+    squares, used = [], []
+    for group in groups:
+        if not group:
+            squares.append(jnp.zeros(()))
+            used.append(jnp.zeros((), jnp.int32))
+            continue
+        at = np.array(group)
+        nu = info.innovation[at]
+        white = solve_lower(cholesky(info.innovation_cov[at][:, at]).factor, nu)
+        squares.append(jnp.sum(white * white))
+        # The innovation of a channel that was not used is exactly zero.
+        used.append(jnp.sum(nu != 0).astype(jnp.int32))
+    return jnp.stack(squares), jnp.stack(used)
 
 
 def member(config: FilterConfig, model: Model, channels: int) -> Filter:
@@ -189,8 +227,8 @@ def filter_params(
     lever_arm: np.ndarray,
     form: ErrorForm,
     mounting: np.ndarray | None = None,
-) -> FilterParams | BankParams:
-    """Return the parameters of the filter or bank of a configuration.
+) -> FilterParams | BankParams | Gated:
+    """Return the parameters of the filter or bank of a configuration, and of its gate.
 
     Args:
         config: The configuration.
@@ -199,6 +237,20 @@ def filter_params(
         form: The definition of the error.
         mounting: Rotation vector to the vehicle's axes ``(3,) [rad]``; ``None`` is no rotation.
     """
+    inner = _ungated(config, drive, lever_arm, form, mounting)
+    if not config.gate:
+        return inner
+    gate = Gate(jnp.array(config.gate_probability), jnp.array(config.gate_patience))
+    return Gated(inner, gate)
+
+
+def _ungated(
+    config: FilterConfig,
+    drive: Drive,
+    lever_arm: np.ndarray,
+    form: ErrorForm,
+    mounting: np.ndarray | None,
+) -> FilterParams | BankParams:
     mounting = np.zeros(3) if mounting is None else mounting
     mean = drive.initial.mean
     cov = columns(form.from_additive, mean, drive.initial.cov)

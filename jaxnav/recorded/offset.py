@@ -15,7 +15,7 @@ from jaxnav.estimation.types import Filter, FilterParams, Info, Obs
 from jaxnav.navigation.models.level_errors import error_form
 from jaxnav.navigation.models.vehicle import FIXES, vehicle
 from jaxnav.numerics.linalg import cholesky, solve_lower
-from jaxnav.recorded.config import FilterConfig
+from jaxnav.recorded.config import ALONE, FilterConfig
 from jaxnav.recorded.methods import filter_params
 from jaxnav.recorded.preparation import prepare
 
@@ -49,7 +49,7 @@ def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
         log: The drive.
         config: The configuration; the search starts from its offset.
     """
-    plain = replace(config, filter="ekf", constraints=False, r_factors=(1.0,), q_factors=(1.0,))
+    plain = replace(config, **ALONE)
     filter = ekf(vehicle(constrained=False))
     value, sigma, step = config.time_offset_s, float("nan"), 0.0
     for _ in range(STEPS):

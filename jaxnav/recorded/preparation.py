@@ -16,6 +16,7 @@ from jaxnav.datasets.inertial import ImuLog
 from jaxnav.datasets.track import GnssTrack
 from jaxnav.estimation.types import Gaussian, Obs
 from jaxnav.navigation.alignment import align_with_heading, course_heading
+from jaxnav.navigation.earth import metres_per_radian
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput
 from jaxnav.navigation.models.vehicle import CONSTRAINTS, FIXES, REST, STEERED, VehicleInput
@@ -26,6 +27,14 @@ from jaxnav.recorded.config import FilterConfig
 from jaxnav.units import DEG
 
 CHANNELS = FIXES.stop + len(CONSTRAINTS)
+DIFFERENCED_S = 5.0
+"""Longest time over which positions are differenced for a course."""
+BRIDGED_S = 60.0
+"""Longest time without inertial samples that a filter is taken over."""
+DIRECTION_S = (12.0, 4.0)
+"""Time before and after the first fast fix in which forward and backward are told apart."""
+SEEN_S = 1.5
+"""Age of a velocity up to which it tells whether the vehicle moves."""
 SMOOTHED_S = 0.2
 """Time over which samples are averaged before a stop is looked for: engines shake faster."""
 LEVEL_S = 2.0
@@ -55,6 +64,7 @@ class Drive(NamedTuple):
         unused: Fixes outside the filter's time, or with no period of their own.
         stopped: ``(T,)`` whether the vehicle is found to be at rest.
         bridged_s: The longest period [s].
+        offset_s: What was added to the times of the fixes [s].
     """
 
     time: np.ndarray
@@ -69,14 +79,16 @@ class Drive(NamedTuple):
     unused: int
     stopped: np.ndarray
     bridged_s: float
+    offset_s: float
 
 
 class _Start(NamedTuple):
-    """The start: sample and fix of it, state, and whether it is from a rest."""
+    """The start: its sample, state, whether it is from a rest, and sigma of the course [rad]."""
 
     sample: int
     state: SinsLevel
     at_rest: bool
+    course_sigma: float
 
 
 def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -> Drive:
@@ -106,6 +118,13 @@ def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -
             f"{log.source}: {len(time) - start.sample} samples are left after the alignment at "
             f"{time[start.sample]:.6g} s; accepted are at least two periods of {every}"
         )
+    longest = int(np.argmax(np.diff(time[start.sample :]))) + start.sample
+    if time[longest + 1] - time[longest] > BRIDGED_S:
+        raise DataError(
+            f"{log.source}: there is no inertial sample from {time[longest]:.6g} s to "
+            f"{time[longest + 1]:.6g} s; accepted are gaps of up to {BRIDGED_S:g} s: cut the log "
+            "there, or mend its clock"
+        )
     step, fix = _nearest_periods(time[ends], fix_time)
     if len(step) < 3:
         raise DataError(
@@ -116,7 +135,7 @@ def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -
     lag, grade = np.zeros(len(ends)), np.ones(len(ends))
     lag[step] = fix_time[fix] - time[ends][step]
     grade[step] = _grade(log.fixes, position_noise)[fix]
-    stopped = still[ends] & config.constraints
+    stopped = still[ends] & config.constraints & ~_seen_moving(log.fixes, fix_time, time[ends])
     return Drive(
         time=time[ends],
         inputs=VehicleInput(
@@ -134,6 +153,7 @@ def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -
         unused=len(fix_time) - len(fix),
         stopped=stopped,
         bridged_s=float(np.max(np.diff(time[start.sample :]))),
+        offset_s=config.time_offset_s,
     )
 
 
@@ -180,6 +200,31 @@ def velocity_of(fixes: GnssTrack) -> np.ndarray:
     return fixes.velocity
 
 
+def course_velocity(fixes: GnssTrack) -> np.ndarray:
+    """Return velocities ``(F, 3)`` for a course: those of the log, else of the positions.
+
+    Positions a second apart or more are differenced, so that their noise stays below that of a car
+    on the move.
+    """
+    velocity = np.array(velocity_of(fixes))
+    unknown = ~np.isfinite(velocity[:, :2]).all(axis=1)
+    if not unknown.any() or len(velocity) < 3:
+        return velocity
+    time = (fixes.time_ns - fixes.time_ns[0]) / 1e9
+    before = np.clip(np.searchsorted(time, time - 0.5, side="right") - 1, 0, None)
+    after = np.clip(np.searchsorted(time, time + 0.5), None, len(time) - 1)
+    span = time[after] - time[before]
+    good = unknown & (span > 0) & (span < DIFFERENCED_S)
+    scale = np.asarray(_metres(jnp.asarray(fixes.geodetic[good])))
+    turn = fixes.geodetic[after[good]] - fixes.geodetic[before[good]]
+    turn[:, 1] = np.remainder(turn[:, 1] + np.pi, 2 * np.pi) - np.pi
+    velocity[good] = (scale * turn)[:, [1, 0, 2]] / span[good][:, None]
+    return velocity
+
+
+_metres = compiled(jax.vmap(metres_per_radian))
+
+
 def _base_noise(fixes: GnssTrack, config: FilterConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return the medians of the logged standard deviations, or the configured ones if larger."""
     position = np.nanmedian(fixes.position_sigma, axis=0)
@@ -196,6 +241,24 @@ def _grade(fixes: GnssTrack, base: np.ndarray) -> np.ndarray:
     """Return how many times worse than the base each fix says it is, one at least."""
     sigma = np.where(np.isfinite(fixes.position_sigma), fixes.position_sigma, base)
     return np.maximum(1.0, np.linalg.norm(sigma, axis=1) / np.linalg.norm(base))
+
+
+def _seen_moving(fixes: GnssTrack, fix_time: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return at which times ``(T,)`` the receiver sees a motion that a smooth road may hide."""
+    velocity = velocity_of(fixes)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    known = np.flatnonzero(np.isfinite(speed))
+    if not len(known):
+        return np.zeros(len(time), bool)
+    sigma = np.full(len(speed), VELOCITY_SIGMA)
+    if fixes.velocity_sigma is not None:
+        sigma = np.fmax(sigma, np.nanmax(fixes.velocity_sigma[:, :2], axis=1, initial=0.0))
+    after = np.clip(np.searchsorted(fix_time[known], time), 0, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = time - fix_time[known[before]] < fix_time[known[after]] - time
+    nearest = known[np.where(earlier, before, after)]
+    close = np.abs(fix_time[nearest] - time) < SEEN_S
+    return close & (speed[nearest] > 3 * sigma[nearest])
 
 
 def _nearest_periods(ends: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -259,7 +322,7 @@ def _start(
     still: np.ndarray,
 ) -> _Start:
     """Return where the filter starts: at the first fix whose course gives the heading."""
-    velocity = velocity_of(log.fixes)
+    velocity = course_velocity(log.fixes)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     inside = (fix_time >= time[0]) & (fix_time < time[-1])
     moving = np.flatnonzero(inside & (speed >= config.align_speed))
@@ -279,8 +342,38 @@ def _start(
     )
     part = slice(rest.stop, sample + 1)
     turns = (log.imu.gyro[part] - gyro) * np.diff(time[part], append=time[sample])[:, None]
-    dcm = _headed(jnp.asarray(accel), jnp.asarray(turns), jnp.asarray(velocity[moving[0]]))
+    ahead = _direction(log, time, fix_time, speed, moving[0]) * velocity[moving[0]]
+    dcm = _headed(jnp.asarray(accel), jnp.asarray(turns), jnp.asarray(ahead))
     return _started(log, sample, moving[0], dcm, jnp.asarray(gyro), at_rest=True)
+
+
+def _direction(
+    log: DriveLog, time: np.ndarray, fix_time: np.ndarray, speed: np.ndarray, fix: int
+) -> float:
+    """Return 1 if the vehicle moves forward at a fix, -1 if backward, by what its surge says.
+
+    The increments of the speed between fixes and those of the forward accelerometer go together in
+    the one case and against each other in the other. Where they do neither it is taken for forward.
+    """
+    before, after = DIRECTION_S
+    near = np.isfinite(speed) & (fix_time >= max(time[0], fix_time[fix] - before))
+    near = np.flatnonzero(near & (fix_time <= min(time[-1], fix_time[fix] + after)))
+    # A vehicle that has been slower than this meanwhile may have changed its direction.
+    slow = near[speed[near] < 0.5]
+    begin = slow[slow < fix][-1:] if np.any(slow < fix) else near[:1]
+    end = slow[slow > fix][:1]
+    near = near[(near >= begin[0]) & (near <= (end[0] if len(end) else near[-1]))]
+    if len(near) < 3:
+        return 1.0
+    force = np.where(log.imu.valid, log.imu.accel[:, 0], 0.0)
+    gained = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(time))])
+    told = np.diff(np.interp(fix_time[near], time, gained))
+    seen, spans = np.diff(speed[near]), np.diff(fix_time[near])
+    # A tilt and a bias push evenly.
+    told = told - spans * np.sum(told) / np.sum(spans)
+    seen = seen - spans * np.sum(seen) / np.sum(spans)
+    size = np.linalg.norm(told) * np.linalg.norm(seen)
+    return -1.0 if size > 0 and float(told @ seen) < -0.5 * size else 1.0
 
 
 def _last_rest(still: np.ndarray, shortest: int) -> slice | None:
@@ -301,7 +394,7 @@ def _moving_start(log: DriveLog, time: np.ndarray, fix_time: np.ndarray, first: 
         DataError: If the fixes do not go on for the time to level by.
     """
     later = np.flatnonzero(fix_time >= fix_time[first] + LEVEL_S)
-    velocity = velocity_of(log.fixes)
+    velocity = course_velocity(log.fixes)
     later = [i for i in later if np.isfinite(velocity[i, :2]).all() and fix_time[i] < time[-1]]
     if not later:
         raise DataError(
@@ -334,15 +427,26 @@ def _headed(force: Array, turns: Array, velocity: Array) -> Array:
 def _started(
     log: DriveLog, sample: int, fix: int, dcm: Array, drift: Array, *, at_rest: bool
 ) -> _Start:
-    velocity = np.nan_to_num(velocity_of(log.fixes)[fix])
+    velocity = np.nan_to_num(course_velocity(log.fixes)[fix])
     position = jnp.asarray(log.fixes.geodetic[fix])
-    return _Start(
-        sample, SinsLevel(dcm, jnp.asarray(velocity), position, drift, jnp.zeros(3)), at_rest
-    )
+    state = SinsLevel(dcm, jnp.asarray(velocity), position, drift, jnp.zeros(3))
+    return _Start(sample, state, at_rest, _course_sigma(log.fixes, fix, velocity))
+
+
+def _course_sigma(fixes: GnssTrack, fix: int, velocity: np.ndarray) -> float:
+    """Return the standard deviation [rad] of the course of a fix."""
+    known = fixes.velocity is not None and np.isfinite(fixes.velocity[fix, :2]).all()
+    if known and fixes.velocity_sigma is not None:
+        sigma = float(np.nan_to_num(np.max(fixes.velocity_sigma[fix, :2])))
+    else:
+        # Two positions about a second apart, of many that might have been fast enough by chance.
+        sigma = 0.0 if known else 2 * 2**0.5 * float(np.max(fixes.position_sigma[fix, :2]))
+    return min(sigma / max(float(np.hypot(*velocity[:2])), 1e-3), math.pi / 2)
 
 
 def _initial(start: _Start, position_noise: np.ndarray) -> Gaussian:
     tilt, heading, drift = REST_SIGMA if start.at_rest else MOVING_SIGMA
+    heading = math.hypot(heading, start.course_sigma)
     # The fix is up to a sample old, and of the antenna.
     position = np.sqrt(position_noise**2 + 1.0)
     blocks: list[Any] = [

@@ -27,7 +27,9 @@ MOUNTING_S = 60.0
 SETTLED_S = 5.0
 MOUNTING_SPEED = 5.0
 MOUNTING_RATE = 3 * DEG
-"""The mounting is from the first minute but its first seconds, above 18 km/h and straight on."""
+MOUNTING_HEADING = 1 * DEG
+"""The mounting is from what is driven above 18 km/h and straight on while the heading is known to
+a degree: on a straight start its error would be taken for that of the mounting."""
 
 
 class ReferenceErrors(NamedTuple):
@@ -105,7 +107,7 @@ def mounting(kept: Kept, drive: Drive) -> np.ndarray:
     """Return the rotation vector ``(3,) [rad]`` from the sensors' axes to the vehicle's.
 
     It turns the mean direction of motion, in the sensors' axes, to forward by a heading and a
-    pitch; there is no roll to be seen. No straight part in the first minute makes it zero.
+    pitch; there is no roll to be seen. No straight part with a known heading makes it zero.
     """
     v = np.einsum("nji,nj->ni", np.asarray(kept.mean.dcm), np.asarray(kept.mean.velocity))
     since = drive.time - drive.time[0]
@@ -114,8 +116,8 @@ def mounting(kept: Kept, drive: Drive) -> np.ndarray:
     width = max(1, round(1 / float(np.median(np.asarray(drive.inputs.inertial.dt)))))
     smooth = np.convolve(rate, np.full(width, 1 / width), "same")
     straight = np.abs(smooth) < MOUNTING_RATE
-    early = (since > SETTLED_S) & (since < MOUNTING_S)
-    used = early & straight & (v[:, 0] > MOUNTING_SPEED)
+    known = (since > SETTLED_S) & (np.asarray(kept.sigma)[:, 2] < MOUNTING_HEADING)
+    used = known & straight & (v[:, 0] > MOUNTING_SPEED)
     if not used.any():
         return np.zeros(3)
     x, y, z = np.sum(v[used], axis=0)

@@ -47,7 +47,7 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
     Raises:
         ConfigError: If the drive is too short to be judged on its second half.
     """
-    plain = replace(config, constraints=False)
+    plain = replace(config, constraints=False, gate=False)
     if config.tune_offset:
         plain = replace(plain, time_offset_s=likeliest_offset(log, config).value_s)
     drive = prepare(log, plain, config.noise_rate_hz)
