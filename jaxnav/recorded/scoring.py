@@ -27,9 +27,11 @@ MOUNTING_S = 60.0
 SETTLED_S = 5.0
 MOUNTING_SPEED = 5.0
 MOUNTING_RATE = 3 * DEG
-MOUNTING_HEADING = 1 * DEG
-"""The mounting is from what is driven above 18 km/h and straight on while the heading is known to
-a degree: on a straight start its error would be taken for that of the mounting."""
+MOUNTING_SIGMA = (1 * DEG, 2 * DEG)
+"""The mounting is from what is driven above 18 km/h and straight on. Its heading is from when that
+of the sensors is known to the first of these: on a straight start its error would be taken for the
+mounting. Its pitch is from when the tilt is known to the second, the least that an accelerometer's
+bias allows."""
 
 
 class ReferenceErrors(NamedTuple):
@@ -107,7 +109,7 @@ def mounting(kept: Kept, drive: Drive) -> np.ndarray:
     """Return the rotation vector ``(3,) [rad]`` from the sensors' axes to the vehicle's.
 
     It turns the mean direction of motion, in the sensors' axes, to forward by a heading and a
-    pitch; there is no roll to be seen. No straight part with a known heading makes it zero.
+    pitch; there is no roll to be seen. Either is zero where nothing shows it.
     """
     v = np.einsum("nji,nj->ni", np.asarray(kept.mean.dcm), np.asarray(kept.mean.velocity))
     since = drive.time - drive.time[0]
@@ -116,13 +118,13 @@ def mounting(kept: Kept, drive: Drive) -> np.ndarray:
     width = max(1, round(1 / float(np.median(np.asarray(drive.inputs.inertial.dt)))))
     smooth = np.convolve(rate, np.full(width, 1 / width), "same")
     straight = np.abs(smooth) < MOUNTING_RATE
-    known = (since > SETTLED_S) & (np.asarray(kept.sigma)[:, 2] < MOUNTING_HEADING)
-    used = known & straight & (v[:, 0] > MOUNTING_SPEED)
-    if not used.any():
-        return np.zeros(3)
-    x, y, z = np.sum(v[used], axis=0)
-    turn = Rotation.from_euler("zy", [-np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
-    return turn.as_rotvec()
+    driven = (since > SETTLED_S) & straight & (v[:, 0] > MOUNTING_SPEED)
+    sigma, (heading, tilt) = np.asarray(kept.sigma), MOUNTING_SIGMA
+    known = (sigma[:, 2] < heading, np.all(sigma[:, :2] < tilt, axis=1))
+    headed, level = (np.sum(v[driven & good], axis=0) for good in known)
+    yaw = -np.arctan2(headed[1], headed[0])
+    pitch = np.arctan2(level[2], np.hypot(level[0], level[1]))
+    return Rotation.from_euler("zy", [yaw, pitch]).as_rotvec()
 
 
 def against_reference(log: DriveLog, drive: Drive, kept: Kept, offset_s: float) -> ReferenceErrors:
