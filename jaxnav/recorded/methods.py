@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -100,7 +101,7 @@ class Kept(NamedTuple):
 
 
 def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> Method:
-    """Return the filter or bank of a configuration.
+    """Return the filter or bank of a configuration; the same one again for the same choices.
 
     Args:
         config: The configuration.
@@ -108,18 +109,33 @@ def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> 
         constrained: Whether the model has the channels of the constraints.
     """
     error = ERRORS.get(config.filter, "additive")
+    about = tuple(np.asarray(origin).tolist()) if error == "right-invariant" else (0.0, 0.0, 0.0)
+    weighed = config.rule if members(config) > 1 else None
+    return _method(config.filter, weighed, config.gate, error, about, constrained)
+
+
+@cache
+def _method(
+    name: str,
+    weighed: str | None,
+    gate: bool,
+    error: LevelError,
+    about: tuple[float, ...],
+    constrained: bool,
+) -> Method:
+    """Return a method; another call finds it and with it the programs compiled for it."""
+    origin = jnp.array(about)
     model = vehicle(error, origin, constrained=constrained)
     channels = CHANNELS if constrained else FIXES.stop
-    one, form = member(config, model, channels), error_form(error, origin)
-    banked = members(config) > 1
-    chosen = bank(one, rule(config)) if banked else one
-    if config.gate:
+    one, form = member(name, model, channels), error_form(error, origin)
+    chosen = one if weighed is None else bank(one, rule(weighed))
+    if gate:
         chosen = gated(chosen, RECEIVER)
 
     def record(state: Any, info: Info) -> Kept:
         estimate = chosen.estimate(state)
-        own = state.inner if config.gate else state
-        weights = jnp.exp(own.log_weights) if banked else jnp.zeros(0)
+        own = state.inner if gate else state
+        weights = jnp.zeros(0) if weighed is None else jnp.exp(own.log_weights)
         seen = jnp.diag(info.innovation_cov)[FIXES]
         group_nis, used = by_group(info)
         return Kept(
@@ -135,7 +151,7 @@ def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> 
             weights,
         )
 
-    return Method(chosen, model, form, record, banked)
+    return Method(chosen, model, form, record, weighed is not None)
 
 
 def by_group(info: Info) -> tuple[Array, Array]:
@@ -157,19 +173,20 @@ def by_group(info: Info) -> tuple[Array, Array]:
     return jnp.stack(squares), jnp.stack(used)
 
 
-def member(config: FilterConfig, model: Model, channels: int) -> Filter:
-    """Return the single filter of a configuration."""
+def member(name: str, model: Model, channels: int) -> Filter:
+    """Return a single filter by its name."""
     builders: dict[str, Callable[[], Filter]] = {
         "ukf": lambda: ukf(model),
         "versoria-ekf": lambda: versoria(ekf, model),
         "sage-husa-ekf": lambda: sage_husa(ekf, model, channels=channels),
         "iae": lambda: innovation_adaptive(ekf, model),
+        **dict.fromkeys(("ekf", *ERRORS), lambda: ekf(model)),
     }
-    return builders.get(config.filter, lambda: ekf(model))()
+    return builders[name]()
 
 
-def rule(config: FilterConfig) -> WeightRule:
-    """Return the weight rule of a configuration."""
+def rule(name: str) -> WeightRule:
+    """Return a weight rule by its name."""
     rules = {
         "floor": lambda: chain(bayes(), floor()),
         "bayes": bayes,
@@ -178,7 +195,7 @@ def rule(config: FilterConfig) -> WeightRule:
         "markov": lambda: chain(markov(), bayes()),
         "penalty": penalty,
     }
-    return rules[config.rule]()
+    return rules[name]()
 
 
 def rule_params(config: FilterConfig, period: float) -> Any:

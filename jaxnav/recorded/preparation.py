@@ -37,6 +37,8 @@ SEEN_S = 1.5
 """Age of a velocity up to which it tells whether the vehicle moves."""
 SMOOTHED_S = 0.2
 """Time over which samples are averaged before a stop is looked for: engines shake faster."""
+PUSHED = 0.85
+"""Horizontal force [m/s^2] beyond that of the log's middle which is not taken for a rest."""
 LEVEL_S = 2.0
 """Shortest rest to level by, and time to level by on the move [s]."""
 REST_SIGMA = (0.5 * DEG, 5 * DEG, 0.03 * DEG)
@@ -135,7 +137,8 @@ def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -
     lag, grade = np.zeros(len(ends)), np.ones(len(ends))
     lag[step] = fix_time[fix] - time[ends][step]
     grade[step] = _grade(log.fixes, position_noise)[fix]
-    stopped = still[ends] & config.constraints & ~_seen_moving(log.fixes, fix_time, time[ends])
+    moves = _seen_moving(log.fixes, config, fix_time, time[ends])
+    stopped = still[ends] & config.constraints & ~moves
     return Drive(
         time=time[ends],
         inputs=VehicleInput(
@@ -161,7 +164,8 @@ def still_samples(imu: ImuLog, config: FilterConfig) -> np.ndarray:
     """Return at which samples ``(N,)`` the vehicle has been at rest for ``stop_time_s``.
 
     Of means over a fifth of a second, the rates stay below ``stop_gyro_dps`` from their median in
-    quiet times, and the specific force scatters by less than ``stop_accel``.
+    quiet times, and the specific force scatters by less than ``stop_accel`` about a level mean: a
+    steady braking is as quiet, and pushes. A rest on a slope of more than 5 deg is not found.
     """
     width = max(1, round(SMOOTHED_S / imu.step_s))
     window = max(2, round(config.stop_time_s / imu.step_s))
@@ -171,7 +175,9 @@ def still_samples(imu: ImuLog, config: FilterConfig) -> np.ndarray:
         return still
     gyro, accel = (_means(values, width) for values in (imu.gyro, imu.accel))
     scatter = sliding_window_view(accel, window, axis=0).std(axis=-1).max(axis=1)
-    quiet = scatter < config.stop_accel
+    level = sliding_window_view(accel[:, :2], window, axis=0).mean(axis=-1)
+    pushed = np.abs(level - np.median(accel[:, :2], axis=0)).max(axis=1)
+    quiet = (scatter < config.stop_accel) & (pushed < PUSHED)
     if not quiet.any():
         return still
     last = window - 1
@@ -243,22 +249,31 @@ def _grade(fixes: GnssTrack, base: np.ndarray) -> np.ndarray:
     return np.maximum(1.0, np.linalg.norm(sigma, axis=1) / np.linalg.norm(base))
 
 
-def _seen_moving(fixes: GnssTrack, fix_time: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return at which times ``(T,)`` the receiver sees a motion that a smooth road may hide."""
-    velocity = velocity_of(fixes)
+def _seen_moving(
+    fixes: GnssTrack, config: FilterConfig, fix_time: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    """Return at which times ``(T,)`` the fixes show a motion that sensors cannot feel."""
+    velocity = course_velocity(fixes)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     known = np.flatnonzero(np.isfinite(speed))
     if not len(known):
         return np.zeros(len(time), bool)
-    sigma = np.full(len(speed), VELOCITY_SIGMA)
-    if fixes.velocity_sigma is not None:
-        sigma = np.fmax(sigma, np.nanmax(fixes.velocity_sigma[:, :2], axis=1, initial=0.0))
+    sigma = np.array([_speed_sigma(fixes, i) for i in known])
     after = np.clip(np.searchsorted(fix_time[known], time), 0, len(known) - 1)
     before = np.maximum(after - 1, 0)
     earlier = time - fix_time[known[before]] < fix_time[known[after]] - time
-    nearest = known[np.where(earlier, before, after)]
-    close = np.abs(fix_time[nearest] - time) < SEEN_S
-    return close & (speed[nearest] > 3 * sigma[nearest])
+    nearest = np.where(earlier, before, after)
+    close = np.abs(fix_time[known][nearest] - time) < SEEN_S
+    return close & (speed[known][nearest] > 3 * np.maximum(sigma, config.velocity_sigma)[nearest])
+
+
+def _speed_sigma(fixes: GnssTrack, fix: int) -> float:
+    """Return the standard deviation [m/s] of a speed of :func:`course_velocity`."""
+    known = fixes.velocity is not None and np.isfinite(fixes.velocity[fix, :2]).all()
+    if known and fixes.velocity_sigma is not None:
+        return float(np.nan_to_num(np.max(fixes.velocity_sigma[fix, :2])))
+    # Two positions about a second apart.
+    return 0.0 if known else 2**0.5 * float(np.max(fixes.position_sigma[fix, :2]))
 
 
 def _nearest_periods(ends: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -435,12 +450,9 @@ def _started(
 
 def _course_sigma(fixes: GnssTrack, fix: int, velocity: np.ndarray) -> float:
     """Return the standard deviation [rad] of the course of a fix."""
+    # A differenced one is of many that might have been fast enough by chance.
     known = fixes.velocity is not None and np.isfinite(fixes.velocity[fix, :2]).all()
-    if known and fixes.velocity_sigma is not None:
-        sigma = float(np.nan_to_num(np.max(fixes.velocity_sigma[fix, :2])))
-    else:
-        # Two positions about a second apart, of many that might have been fast enough by chance.
-        sigma = 0.0 if known else 2 * 2**0.5 * float(np.max(fixes.position_sigma[fix, :2]))
+    sigma = _speed_sigma(fixes, fix) * (1 if known else 2)
     return min(sigma / max(float(np.hypot(*velocity[:2])), 1e-3), math.pi / 2)
 
 
