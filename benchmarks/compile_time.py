@@ -30,7 +30,7 @@ from benchmarks._problem import (
     oracle,
 )
 from jaxnav.estimation.banks.mixture import immae, mmae, panel
-from jaxnav.estimation.banks.weights import WindowedReset
+from jaxnav.estimation.banks.reset import WindowedReset
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.filters.square_root import square_root_kf
 from jaxnav.estimation.run import run

@@ -51,11 +51,10 @@ if TYPE_CHECKING:
     from jaxnav.estimation.banks.mixture import (
         panel as panel,
     )
+    from jaxnav.estimation.banks.reset import WindowedReset as WindowedReset
+    from jaxnav.estimation.banks.reset import windowed_reset as windowed_reset
     from jaxnav.estimation.banks.weights import (
         Penalty as Penalty,
-    )
-    from jaxnav.estimation.banks.weights import (
-        WindowedReset as WindowedReset,
     )
     from jaxnav.estimation.banks.weights import (
         bayes as bayes,
@@ -77,9 +76,6 @@ if TYPE_CHECKING:
     )
     from jaxnav.estimation.banks.weights import (
         penalty as penalty,
-    )
-    from jaxnav.estimation.banks.weights import (
-        windowed_reset as windowed_reset,
     )
     from jaxnav.estimation.bounds import (
         linearised_at_truth as linearised_at_truth,
@@ -159,7 +155,6 @@ _HOMES = {
     ),
     "jaxnav.estimation.banks.weights": (
         "Penalty",
-        "WindowedReset",
         "bayes",
         "chain",
         "fixed",
@@ -167,8 +162,8 @@ _HOMES = {
         "forget",
         "markov",
         "penalty",
-        "windowed_reset",
     ),
+    "jaxnav.estimation.banks.reset": ("WindowedReset", "windowed_reset"),
     "jaxnav.estimation.bounds": ("linearised_at_truth", "oracle"),
     "jaxnav.estimation.filters.adaptive": ("innovation_adaptive",),
     "jaxnav.estimation.filters.iterated": (

@@ -7,16 +7,8 @@ from jax import Array
 
 from jaxnav.estimation.banks.imm import imm, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, bank, immae, mmae
-from jaxnav.estimation.banks.weights import (
-    Penalty,
-    WindowedReset,
-    bayes,
-    chain,
-    floor,
-    forget,
-    markov,
-    penalty,
-)
+from jaxnav.estimation.banks.reset import WindowedReset
+from jaxnav.estimation.banks.weights import Penalty, bayes, chain, floor, forget, markov, penalty
 from jaxnav.estimation.bounds import oracle
 from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
 from jaxnav.estimation.filters.iterated import (

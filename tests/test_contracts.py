@@ -24,7 +24,7 @@ from jaxnav.estimation.filters.sigma_point import square_root_ukf, ukf
 from jaxnav.estimation.filters.square_root import square_root_ekf
 from jaxnav.estimation.run import Trace, run
 from jaxnav.estimation.tune.losses import negative_log_likelihood
-from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs
+from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs, SureObs
 from tests.cases import SWITCHING, THETA, Noise, cases
 from tests.oracles.kalman import (
     History,
@@ -225,9 +225,12 @@ def test_poisoned_run_leaves_the_others_bitwise_unchanged(name: str) -> None:
     plain = batch_run(name, CASES[name].params, PROBLEM.z).record
     poisoned = batch_run(name, CASES[name].params, PROBLEM.z.at[2, 1, 0].set(jnp.nan)).record
     others = np.array([0, 1, 3, 4, 5])
+    told = np.zeros(STEPS, bool)
+    told[1] = True
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(poisoned), strict=True):
         np.testing.assert_array_equal(a[others], b[others])
-    assert not np.all(np.isfinite(poisoned[0].mean[2]))
+    raised = np.asarray(poisoned[1].flags)[2] & Flag.NOT_FINITE > 0
+    np.testing.assert_array_equal(raised, told)
 
 
 @each_case
@@ -355,7 +358,12 @@ def _misfits() -> dict[str, tuple[Model, FilterParams, Obs, str]]:
     return {
         "prior": (model, params._replace(initial=prior), obs, r"\(3, 3\).*\(4, 4\)"),
         "data": (model, params, wide, r"z \(3,\) and valid \(3,\).*\(2,\)"),
-        "mask": (model, params, obs._replace(valid=wide.valid), r"valid \(3,\).*\(2,\)"),
+        "mask": (
+            model,
+            params,
+            obs._replace(valid=wide.valid),
+            r"z \(12, 2\) and valid \(12, 3\); both must be \(T, m\)",
+        ),
         "R": (
             model._replace(observation_noise=lambda p, x, u: jnp.eye(3)),
             params,
@@ -412,6 +420,6 @@ def test_filters_that_hand_noise_to_their_model_name_it_too(
     build: Callable[[Callable[[Model], Filter], Model], Filter], wrong: str
 ) -> None:
     model, params, obs, message = MISFITS[wrong]
-    channels = r"|3 channels" if wrong in ("data", "mask") else ""
+    channels = r"|3 channels" if wrong == "data" else ""
     with pytest.raises(ValueError, match=message + channels):
         run(build(ekf, model), params, PROBLEM.inputs, obs)

@@ -18,7 +18,8 @@ import jaxnav
 from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.imm import uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams
-from jaxnav.estimation.banks.weights import Penalty, WindowedReset
+from jaxnav.estimation.banks.reset import WindowedReset
+from jaxnav.estimation.banks.weights import Penalty
 from jaxnav.estimation.filters import sigma_point, square_root
 from jaxnav.estimation.filters.adaptive import Adaptation
 from jaxnav.estimation.filters.kalman import kf

@@ -32,8 +32,9 @@ from jaxnav.recorded.analysis import Report, analyse
 from jaxnav.recorded.config import FilterConfig, check, from_toml
 from jaxnav.recorded.figures import draw
 from jaxnav.recorded.methods import member_names, rule_params
+from jaxnav.recorded.motion import still_samples
 from jaxnav.recorded.outputs import write_trajectory
-from jaxnav.recorded.preparation import prepare, still_samples
+from jaxnav.recorded.preparation import prepare
 from jaxnav.recorded.scoring import attitude_angles, diverged, horizontal
 from jaxnav.recorded.tuning import likeliest_offset
 from jaxnav.studies.base import ConfigError

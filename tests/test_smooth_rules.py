@@ -8,7 +8,8 @@ import numpy as np
 from jax import Array
 
 from jaxnav.compiling import compiled
-from jaxnav.estimation.banks.weights import Floor, WindowedReset, floor, windowed_reset
+from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.weights import Floor, floor
 from jaxnav.estimation.filters.adaptive import Adaptation, moved_log_factor, softly_clamped
 from jaxnav.estimation.filters.line_search import Search, step_length
 from jaxnav.estimation.types import Info, Obs

@@ -10,14 +10,8 @@ import pytest
 
 from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, bank, mmae, rewatch
-from jaxnav.estimation.banks.weights import (
-    WindowedReset,
-    bayes,
-    chain,
-    floor,
-    markov,
-    windowed_reset,
-)
+from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.weights import bayes, chain, floor, markov
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.fit import Validation, fit, fit_lbfgs

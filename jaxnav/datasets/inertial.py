@@ -27,6 +27,8 @@ GAP = 1.5
 """Intervals above so many median intervals are gaps."""
 REPEATED = 0.05
 """Share of samples that may repeat a time: a logger that wrote some of them twice."""
+MANY = 100
+"""Samples above which a share of them means something."""
 SPARSEST = 100
 """Samples of a regular grid for each sample of the log, at most."""
 
@@ -100,7 +102,7 @@ def assemble(time_ns: NDArray[np.int64], values: NDArray[np.float64], source: st
             "previous one; accepted are times that do not decrease"
         )
     repeats = float(np.mean(steps == 0)) if len(steps) else 0.0
-    if repeats > REPEATED:
+    if repeats > REPEATED and len(steps) > MANY:
         raise DataError(
             f"{source}: {repeats:.0%} of the samples repeat the time of the one before: their "
             "stamps are too coarse for the rate; accepted are stamps that tell samples apart"

@@ -6,7 +6,7 @@ Knows nothing of navigation: a state-space model from any field is a :class:`~.t
 
 def catalogue() -> dict[str, dict[str, str]]:
     """Return the filters, banks and weight rules with the first line of their documentation."""
-    from jaxnav.estimation.banks import imm, mixture, weights
+    from jaxnav.estimation.banks import imm, mixture, rules
     from jaxnav.estimation.filters import (
         adaptive,
         iterated,
@@ -36,7 +36,7 @@ def catalogue() -> dict[str, dict[str, str]]:
             sage_husa.sage_husa,
         ),
         "banks": (mixture.bank, mixture.mmae, mixture.immae, imm.imm, mixture.panel),
-        "weight rules": tuple(weights.RULES.values()),
+        "weight rules": tuple(rules.RULES.values()),
     }
     return {
         title: {entry.__name__: (entry.__doc__ or "").splitlines()[0] for entry in entries}

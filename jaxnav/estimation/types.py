@@ -37,10 +37,11 @@ class Flag(IntFlag):
         INDEFINITE: A covariance (the prior, the process noise, that of the state) was not symmetric
             and positive semi-definite when it was needed; a root of it was made by the nearest
             factor at hand.
-        NOT_FINITE: A channel that was said to be valid had a value that is not finite, or noise
-            that is not a number: it was left out as if it were missing.
-        INVALID_NOISE: The observation noise was no covariance, having a negative variance or a
-            correlation beyond one; it was used as it was.
+        NOT_FINITE: A channel that was said to be valid had a value that is not finite: it was left
+            out as if it were missing.
+        INVALID_NOISE: The observation noise was no covariance, having a negative variance
+            or a correlation beyond one, and was used as it was; or was not a number: the channel
+            was left out, and the update counts as failed.
         NO_WEIGHTS: A weight rule gave no probabilities, as with parameters outside their domain:
             the bank's estimate means nothing from here on.
         REFUSED: A gate left channels out that contradict the prediction.

@@ -12,7 +12,7 @@ from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Flag
 from jaxnav.navigation.models.vehicle import FIXES
-from jaxnav.recorded import audit
+from jaxnav.recorded.audit import audit
 from jaxnav.recorded.config import FilterConfig, check, members
 from jaxnav.recorded.experiments import (
     NoiseScores,
@@ -21,6 +21,7 @@ from jaxnav.recorded.experiments import (
     hide_and_score,
     single_model,
 )
+from jaxnav.recorded.findings import document_of, faults
 from jaxnav.recorded.methods import Kept, Method, filter_params, member_names, method
 from jaxnav.recorded.offset import Offset, likeliest_offset
 from jaxnav.recorded.preparation import Drive, prepare
@@ -105,7 +106,7 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         tell("added noise", 1, 1)
     if lost:
         notes.append("a run with fixes hidden diverged")
-    findings = audit.audit(log, drive, kept)
+    findings = audit(log, drive, kept)
     off = fix_errors(chosen.model, single_model(params), drive, kept.mean)
     names = member_names(config) if members(config) > 1 else []
     document = {
@@ -118,8 +119,8 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         "time_offset": _offset(config, offset),
         "members": names,
         "filter": _filter_scores(drive, kept, off),
-        "audit": audit.document(findings),
-        "faults": audit.faults(findings),
+        "audit": document_of(findings),
+        "faults": faults(findings),
         "refused": _refused(log, drive, kept),
         "diverged": diverged(kept, drive) or lost,
         "reference": reference and _reference_scores(reference),

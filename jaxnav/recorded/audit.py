@@ -7,17 +7,17 @@ with wrong axes, sign, unit or clock shows there, whatever a filter makes of it.
 """
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Flag
+from jaxnav.recorded.findings import Finding, judged
 from jaxnav.recorded.methods import Kept
-from jaxnav.recorded.preparation import Drive, course_velocity
+from jaxnav.recorded.motion import course_velocity
+from jaxnav.recorded.preparation import Drive
 from jaxnav.units import DEG
-
-Verdict = Literal["pass", "doubt", "fault", "not seen"]
 
 GRID_S = 0.1
 SPAN_S = 1.0
@@ -28,26 +28,6 @@ LEAST_TURN = 3 * DEG
 """Root mean square of the turn rate [rad/s] that a course must show to be compared at all."""
 COURSE_SPEED = 3.0
 """Speed [m/s] from which on a velocity gives a course."""
-
-
-class Finding(NamedTuple):
-    """One number of a drive and what it says.
-
-    Attributes:
-        name: What was looked at.
-        verdict: "pass", "doubt", "fault", or "not seen" where the drive does not show it.
-        value: The number; NaN where it is not seen.
-        accepted: Bounds within which it passes, as an interval.
-        unit: Of the number.
-        says: For a doubt or a fault, what it is and what to try, in a sentence.
-    """
-
-    name: str
-    verdict: Verdict
-    value: float
-    accepted: tuple[float, float]
-    unit: str
-    says: str = ""
 
 
 def audit(log: DriveLog, drive: Drive, kept: Kept) -> list[Finding]:
@@ -68,32 +48,6 @@ def audit(log: DriveLog, drive: Drive, kept: Kept) -> list[Finding]:
     ]
 
 
-def faults(findings: list[Finding]) -> list[str]:
-    """Return the sentences of the faults."""
-    return [finding.says for finding in findings if finding.verdict == "fault"]
-
-
-def document(findings: list[Finding]) -> list[dict[str, Any]]:
-    """Return the findings for ``summary.json``."""
-    return [finding._asdict() for finding in findings]
-
-
-def _judged(
-    name: str,
-    value: float,
-    accepted: tuple[float, float],
-    doubted: tuple[float, float],
-    unit: str,
-    says: str,
-) -> Finding:
-    """Return a finding: within ``accepted`` it passes, within ``doubted`` it is in doubt."""
-    if not math.isfinite(value):
-        return Finding(name, "not seen", math.nan, accepted, unit)
-    inside = [low <= value <= high for low, high in (accepted, doubted)]
-    verdict: Verdict = "pass" if inside[0] else "doubt" if inside[1] else "fault"
-    return Finding(name, verdict, value, accepted, unit, "" if verdict == "pass" else says)
-
-
 def _longest_run(same: np.ndarray) -> tuple[int, int]:
     """Return the length of the longest run of True and where it begins."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
@@ -112,7 +66,7 @@ def _samples(log: DriveLog) -> list[Finding]:
     length, begin = _longest_run(same)
     since = (log.imu.time_ns[begin] - log.imu.time_ns[0]) / 1e9
     lasted = length * log.imu.step_s
-    repeated = _judged(
+    repeated = judged(
         "repeated samples",
         lasted,
         (0.0, 0.1),
@@ -124,7 +78,7 @@ def _samples(log: DriveLog) -> list[Finding]:
     spread = values[log.imu.valid].std(axis=0)
     names = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
     dead = [name for name, sigma in zip(names, spread, strict=True) if sigma == 0]
-    alive = _judged(
+    alive = judged(
         "dead axes",
         float(len(dead)),
         (0.0, 0.0),
@@ -136,7 +90,7 @@ def _samples(log: DriveLog) -> list[Finding]:
     tilt = math.degrees(math.acos(np.clip(mean[2] / max(float(np.linalg.norm(mean)), 1e-9), -1, 1)))
     axis = "xyz"[int(np.argmax(np.abs(mean)))]
     sign = "-" if mean[int(np.argmax(np.abs(mean)))] < 0 else "+"
-    upright = _judged(
+    upright = judged(
         "gravity from the z axis",
         tilt,
         (0.0, 20.0),
@@ -156,7 +110,7 @@ def _receiver(log: DriveLog, drive: Drive) -> list[Finding]:
     length, begin = _longest_run(same & ~drive.stopped[at])
     lasted = float(time[begin + length] - time[begin]) if length else 0.0
     return [
-        _judged(
+        judged(
             "frozen fixes",
             lasted,
             (0.0, 2.0),
@@ -233,7 +187,7 @@ def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
     best = int(np.argmax(np.abs(found)))
     strength, late = float(found[best]), float(lags[best]) * GRID_S
     here, slope = _matched(course, gyro, int(lags[best]))
-    agree = _judged(
+    agree = judged(
         names[0],
         strength,
         (0.8, 1.0 + 1e-9),
@@ -248,7 +202,7 @@ def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
     if abs(strength) < 0.6:
         return [agree, *(Finding(name, "not seen", math.nan, (0.0, 0.0), "") for name in names[1:])]
     ratio = abs(slope)
-    scale = _judged(
+    scale = judged(
         names[1],
         ratio,
         (0.9, 1.1),
@@ -257,7 +211,7 @@ def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
         f"the z gyro turns {ratio:.3g} times as fast as the course of the fixes: "
         + ("its unit is not that of the header" if not 0.2 < ratio < 5 else "its scale is wrong"),
     )
-    clocks = _judged(
+    clocks = judged(
         names[2],
         late,
         (-0.35, 0.35),
@@ -300,7 +254,7 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
         else "does not show it"
     )
     return [
-        _judged(
+        judged(
             "forward axis",
             along,
             (0.3, 1.0 + 1e-9),
@@ -332,7 +286,7 @@ def _innovations(drive: Drive, kept: Kept) -> list[Finding]:
                 if value > 1
                 else "; --steered-sigma may be smaller"
             )
-            findings.append(_judged(f"NIS, {group}", value, (0.01, 4.0), (0.0, 10.0), "", says))
+            findings.append(judged(f"NIS, {group}", value, (0.01, 4.0), (0.0, 10.0), "", says))
             continue
         says += (
             ": noise is larger than stated, or a sensor is wrong; the standard deviations of the "
@@ -341,7 +295,7 @@ def _innovations(drive: Drive, kept: Kept) -> list[Finding]:
             else ": the noise is stated too large; the standard deviations of the result are too "
             "large, and outliers pass"
         )
-        findings.append(_judged(f"NIS, {group}", value, (0.2, 3.0), (0.05, 10.0), "", says))
+        findings.append(judged(f"NIS, {group}", value, (0.2, 3.0), (0.05, 10.0), "", says))
     at = drive.fix_step
     used = channels[at, 1] > 0
     white = (np.asarray(kept.innovation) / np.asarray(kept.innovation_sigma))[at][used][:, 3:5]
@@ -350,7 +304,7 @@ def _innovations(drive: Drive, kept: Kept) -> list[Finding]:
         both = np.sum(white[1:] * white[:-1])
         memory = float(both / np.sum(white * white))
     findings.append(
-        _judged(
+        judged(
             "memory of positions",
             memory,
             (-0.5, 0.8),
@@ -364,7 +318,7 @@ def _innovations(drive: Drive, kept: Kept) -> list[Finding]:
     flags = np.asarray(kept.flags)[at]
     share = float(np.mean((flags & (Flag.REFUSED | Flag.REOPENED)) > 0)) if len(at) else math.nan
     findings.append(
-        _judged(
+        judged(
             "refused fixes",
             share,
             (0.0, 0.01),
@@ -388,7 +342,7 @@ def _estimates(drive: Drive, kept: Kept) -> list[Finding]:
         sideways = float(np.mean(np.abs(v[fast, 1]) > np.abs(v[fast, 0])))
     backward = float(np.mean(v[fast, 0] < 0)) if fast.sum() > 50 else math.nan
     return [
-        _judged(
+        judged(
             "accelerometer bias",
             bias,
             (0.0, 0.6),
@@ -397,7 +351,7 @@ def _estimates(drive: Drive, kept: Kept) -> list[Finding]:
             f"an accelerometer bias of {bias:.3g} m/s^2 was estimated: more than a sensor has; "
             "check axes, units and clocks",
         ),
-        _judged(
+        judged(
             "gyro drift",
             drift,
             (0.0, 1.5),
@@ -406,7 +360,7 @@ def _estimates(drive: Drive, kept: Kept) -> list[Finding]:
             f"a gyro drift of {drift:.3g} deg/s was estimated: more than a sensor has; check axes, "
             "units and clocks",
         ),
-        _judged(
+        judged(
             "motion sideways",
             sideways,
             (0.0, 0.05),
@@ -415,7 +369,7 @@ def _estimates(drive: Drive, kept: Kept) -> list[Finding]:
             f"for {sideways:.0%} of the time the vehicle moves more sideways than forward: heading "
             "or axes are wrong",
         ),
-        _judged(
+        judged(
             "motion backward",
             backward,
             (0.0, 0.3),

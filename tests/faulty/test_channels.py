@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Noise, cases
 
 import jaxnav as jn
 from checks.failed_banks import descend, score
 from jaxnav.compiling import compiled
 from jaxnav.estimation.types import Flag
+from tests.cases import Noise, cases
 
 STEPS = 12
 ONE, ALL, LATE = 3, 6, 8
@@ -96,31 +96,27 @@ def ran(name: str, cases: list[tuple[Any, Step, jn.Obs]]) -> list[Told]:
 @each_case
 def test_what_cannot_be_used_is_left_out_and_told(name: str) -> None:
     params, inputs, obs = CASES[name].params, steps(), observations()
-    infinite, unknown = steps(), steps()
+    infinite = steps()
     infinite.noise[ONE, 1, 1] = np.inf
     infinite.noise[ALL, [0, 1], [0, 1]] = np.inf
-    unknown.noise[ONE, 1, 1] = np.nan
-    unknown.noise[ALL] = np.nan
     lost = np.array(obs.z)
     lost[ONE, 1], lost[ALL] = np.nan, (np.inf, -np.inf)
-    missing, by_variance, by_noise, by_value, clean = ran(
+    missing, by_variance, by_value, clean = ran(
         name,
         [
             (params, inputs, without(obs)),
             (params, infinite, obs),
-            (params, unknown, obs),
             (params, inputs, obs._replace(z=lost)),
             (params, inputs, obs),
         ],
     )
-    for other in (by_variance, by_noise, by_value):
+    for other in (by_variance, by_value):
         for a, b in zip(missing.numbers, other.numbers, strict=True):
             np.testing.assert_array_equal(b, a)
     assert not np.any(missing.flags & Flag.NOT_FINITE)
     assert not np.any(by_variance.flags & Flag.NOT_FINITE), "an infinite variance is no fault"
-    for broken in (by_noise, by_value):
-        told = np.flatnonzero(broken.flags & Flag.NOT_FINITE)
-        np.testing.assert_array_equal(told, [ONE, ALL])
+    told = np.flatnonzero(by_value.flags & Flag.NOT_FINITE)
+    np.testing.assert_array_equal(told, [ONE, ALL])
     np.testing.assert_array_equal(np.flatnonzero(missing.flags & Flag.NO_OBSERVATION), [ALL])
     assert not np.any(clean.flags)
     assert np.all(np.isfinite(clean.numbers[2]))
@@ -129,18 +125,21 @@ def test_what_cannot_be_used_is_left_out_and_told(name: str) -> None:
 @each_case
 def test_what_is_no_covariance_is_told(name: str) -> None:
     params, obs = CASES[name].params, observations()
-    negative, beyond, shrinking = steps(), steps(), steps()
+    negative, beyond, unknown, shrinking = steps(), steps(), steps(), steps()
+    unknown.noise[LATE, 1, 1] = np.nan
     negative.noise[LATE, 0, 0] = -0.5
     beyond.noise[LATE, [0, 1], [1, 0]] = 2.0
     shrinking.process[LATE] = np.diag([0.01, -0.02])
     uneven, indefinite = (
         with_prior(params, cov) for cov in ([[1.0, 0.2], [0.1, 1.0]], [[1.0, 2.0], [2.0, 1.0]])
     )
-    cases = [(params, given, obs) for given in (negative, beyond, shrinking)]
+    cases = [(params, given, obs) for given in (negative, beyond, unknown, shrinking)]
     cases += [(prior, steps(), obs) for prior in (uneven, indefinite)]
     *noisy, moved, crooked, hollow = ran(name, cases)
     for told in noisy:
         np.testing.assert_array_equal(np.flatnonzero(told.flags & Flag.INVALID_NOISE), [LATE])
+    assert np.isneginf(noisy[-1].numbers[2][LATE])
+    assert np.all(np.isfinite(noisy[-1].numbers[0]))
     assert moved.flags[LATE] & Flag.INDEFINITE
     assert not np.any(moved.flags[:LATE])
     for told in (crooked, hollow):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.banks.log_weights import active
 from jaxnav.estimation.banks.mixture import (
     BankParams,
     BankState,
@@ -13,7 +14,7 @@ from jaxnav.estimation.banks.mixture import (
     likeliest,
     require_bank_params,
 )
-from jaxnav.estimation.banks.weights import active, bayes, switched
+from jaxnav.estimation.banks.weights import bayes, switched
 from jaxnav.estimation.checks import require_log_prior, require_number, require_transition_matrix
 from jaxnav.estimation.types import Filter, Gaussian, Info, Input, Obs
 

@@ -11,14 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.banks.weights import (
-    active,
-    bayes,
-    chain,
-    member_log_likelihood,
-    normalise,
-    windowed_reset,
-)
+from jaxnav.estimation.banks.log_weights import active, member_log_likelihood, normalise
+from jaxnav.estimation.banks.reset import windowed_reset
+from jaxnav.estimation.banks.weights import bayes, chain
 from jaxnav.estimation.checks import described, require_log_prior, require_members
 from jaxnav.estimation.types import (
     Filter,

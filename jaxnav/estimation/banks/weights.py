@@ -10,13 +10,18 @@ those of the filters. The others are smooth as they are: bounds at the machine e
 logarithm finite and decide nothing.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.banks.log_weights import (
+    active,
+    from_peak,
+    member_log_likelihood,
+    normalise,
+)
 from jaxnav.estimation.checks import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -28,44 +33,13 @@ from jaxnav.estimation.checks import (
 from jaxnav.estimation.types import Flag, Info, WeightRule
 
 
-def normalise(log_weights: Array) -> Array:
-    """Return log-weights ``(M,)`` whose weights sum to one; all ``-inf`` stays as it is."""
-    shifted = from_peak(log_weights)
-    some = jnp.any(active(shifted))
-    return shifted - jnp.where(some, jax.nn.logsumexp(jnp.where(some, shifted, 0)), 0)
-
-
-def from_peak(values: Array) -> Array:
-    """Return log-values ``(M,)`` less their largest, which rounds nothing that matters.
-
-    A sum of weights taken at the level of log-likelihoods of -1e6 would be right to 1e-10 only.
-    """
-    peak = jax.lax.stop_gradient(jnp.max(values))
-    return values - jnp.where(jnp.isfinite(peak), peak, 0)
-
-
-def active(log_weights: Array) -> Array:
-    """Return which members ``(M,)`` take part."""
-    return log_weights > -jnp.inf
-
-
-def uniform(log_weights: Array) -> Array:
-    """Return equal log-weights ``(M,)`` over the members that take part."""
-    members = active(log_weights)
-    return jnp.where(members, -jnp.log(jnp.sum(members).astype(log_weights.dtype)), -jnp.inf)
-
-
-def member_log_likelihood(log_likelihood: Array) -> Array:
-    """Return the members' log-likelihoods ``(M,)`` with a failed member's NaN as a veto."""
-    return jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
-
-
 def _stateless(params: Any, log_weights: Array) -> tuple[()]:
     del params, log_weights
     return ()
 
 
-def _stay(params: Any, state: Any, log_weights: Array, k: Array) -> Array:
+def stay(params: Any, state: Any, log_weights: Array, k: Array) -> Array:
+    """Leave log-weights ``(M,)`` as they are: the prediction of a rule that has none."""
     del params, state, k
     return log_weights
 
@@ -79,10 +53,11 @@ def _ignore_data(
 
 def fixed() -> WeightRule:
     """Return the rule that keeps the prior weights: one member alone, or a constant mixture."""
-    return WeightRule(_stateless, _stay, _ignore_data)
+    return WeightRule(_stateless, stay, _ignore_data)
 
 
-def _bayes_step(log_weights: Array, info: Info) -> Array:
+def bayes_step(log_weights: Array, info: Info) -> Array:
+    """Return log-weights ``(M,)`` after Bayes' rule; kept if no likelihood is finite."""
     members = active(log_weights)
     likelihood = jnp.where(members, member_log_likelihood(info.log_likelihood), -jnp.inf)
     posterior = log_weights + from_peak(likelihood)
@@ -103,9 +78,9 @@ def bayes() -> WeightRule:
         params: Any, state: Any, log_weights: Array, info: Info, k: Array
     ) -> tuple[Any, Array]:
         del params, k
-        return state, _bayes_step(log_weights, info)
+        return state, bayes_step(log_weights, info)
 
-    return WeightRule(_stateless, _stay, update)
+    return WeightRule(_stateless, stay, update)
 
 
 class Penalty(NamedTuple):
@@ -162,9 +137,9 @@ def penalty() -> WeightRule:
         normaliser = jnp.where(usable, info.log_likelihood, 0) + 0.5 * info.nis
         evidence = params.normaliser * normaliser - (params.least + grown) * info.nis
         told = info._replace(log_likelihood=jnp.where(usable, evidence, -jnp.inf))
-        return count, _bayes_step(log_weights, told)
+        return count, bayes_step(log_weights, told)
 
-    return WeightRule(init, _stay, update, _check_penalty)
+    return WeightRule(init, stay, update, _check_penalty)
 
 
 def _check_penalty(params: Penalty, count: int) -> None:
@@ -219,7 +194,7 @@ def floor(*, smooth: bool = False) -> WeightRule:
         else:
             require_number("the floor of the weights", params, *domain)
 
-    return WeightRule(_stateless, _stay, update, check)
+    return WeightRule(_stateless, stay, update, check)
 
 
 def forget() -> WeightRule:
@@ -321,88 +296,6 @@ def switch() -> WeightRule:
     return WeightRule(_stateless, predict, _ignore_data, require_transition_matrix)
 
 
-class WindowedReset(NamedTuple):
-    """Parameters of :func:`windowed_reset`.
-
-    Attributes:
-        period: Steps between two assessments, at least one.
-        threshold: Weight in (0, 1] above which the leading model is put to the test.
-        temperature: Width of the smooth threshold; not used by the hard rule.
-    """
-
-    period: Array | float
-    threshold: Array | float
-    temperature: Array | float = 0.05
-
-
-def windowed_reset(*, smooth: bool = False) -> WeightRule:
-    """Return the reset of IMMAE: start anew when a short memory disagrees with the long one.
-
-    A second set of weights starts uniform every ``period`` steps. At the end of a period, if the
-    largest weight exceeds ``threshold`` and the second set prefers another model, the weights are
-    made uniform; the second set always is.
-
-    With ``smooth=True`` every step has a gradient: the second set forgets with the time constant
-    ``period`` instead of starting anew, and a share
-    ``sigmoid((max w - threshold) / temperature) (1 - <w, w2>) / period`` of the weights is replaced
-    by the uniform ones. As the temperature falls the threshold becomes hard, and it alone: a
-    restart at multiples of the period has by the period a gradient of nothing but peaks, which grow
-    with ``k``, so a share in each step stands for it. The maximum is as it is, with a kink where
-    two weights of at most 1/2 lead alike.
-
-    References:
-        Si, Wang, Niu, Eq. (16) and step (5). As printed, Eqs. (15) and (16) are the same recursion;
-        they can differ only if the second set starts anew every period whether or not the first is
-        reset, which is what is done here. The paper gives neither period nor threshold.
-    """
-    return WeightRule(_window_init, _stay, _smooth_reset if smooth else _hard_reset, _check_reset)
-
-
-def _check_reset(params: WindowedReset, count: int) -> None:
-    del count
-    domains = {
-        "period": ("[1, inf)", 1, jnp.inf),
-        "threshold": ("(0, 1]", 0, 1),
-        "temperature": POSITIVE,
-    }
-    require_fields("the parameter of windowed_reset", params, WindowedReset, domains)
-
-
-def _window_init(params: WindowedReset, log_weights: Array) -> Array:
-    del params
-    return uniform(log_weights)
-
-
-def _hard_reset(
-    params: WindowedReset, state: Array, log_weights: Array, info: Info, k: Array
-) -> tuple[Array, Array]:
-    window = _bayes_step(state, info)
-    even = uniform(log_weights)
-    assess = jnp.mod(k.astype(log_weights.dtype), params.period) < 1
-    confident = jnp.max(log_weights) > jnp.log(params.threshold)
-    mismatch = jnp.argmax(log_weights) != jnp.argmax(window)
-    reset = assess & confident & mismatch
-    return jnp.where(assess, even, window), jnp.where(reset, even, log_weights)
-
-
-def _smooth_reset(
-    params: WindowedReset, state: Array, log_weights: Array, info: Info, k: Array
-) -> tuple[Array, Array]:
-    del k
-    members = active(log_weights)
-    fading = 1 - 1 / params.period
-    faded = jnp.where(members, fading * jnp.where(members, state, 0), -jnp.inf)
-    window = _bayes_step(faded, info)
-    w = jnp.exp(log_weights)
-    confident = jax.nn.sigmoid((jnp.max(w) - params.threshold) / params.temperature)
-    mismatch = 1 - jnp.sum(w * jnp.exp(window))
-    share = confident * jnp.maximum(mismatch, jnp.finfo(w.dtype).eps) / params.period
-    even = jnp.where(members, jnp.log(share) + uniform(log_weights), -jnp.inf)
-    kept = jnp.log1p(-share) + jnp.where(members, log_weights, 0)
-    mixed = jnp.logaddexp(kept, jnp.where(members, even, 0))
-    return window, normalise(jnp.where(members, mixed, -jnp.inf))
-
-
 def chain(*rules: WeightRule) -> WeightRule:
     """Return the rules one after another; parameters and state are tuples, one entry a rule."""
 
@@ -434,10 +327,3 @@ def chain(*rules: WeightRule) -> WeightRule:
             rule.check(own, count)
 
     return WeightRule(init, predict, update, check)
-
-
-RULES: dict[str, Callable[..., WeightRule]] = {
-    rule.__name__: rule
-    for rule in (fixed, bayes, penalty, floor, forget, markov, switch, windowed_reset, chain)
-}
-"""The rules by name, for listing."""

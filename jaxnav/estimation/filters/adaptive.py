@@ -113,7 +113,7 @@ def innovation_adaptive(
         told = heard_by(model, params.model, base.estimate(state.inner).mean, u, obs)
         inner, info = base.update(given(params, 1.0, told.noise), state.inner, u, told.obs)
         moved = moved_log_factor(own, state.log_factor, info, told.obs, smooth=smooth)
-        return AdaptiveState(inner, moved), info._replace(flags=info.flags | told.flags)
+        return AdaptiveState(inner, moved), told.upon(info)
 
     def estimate(state: AdaptiveState) -> Gaussian:
         return base.estimate(state.inner)

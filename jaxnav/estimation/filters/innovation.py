@@ -22,19 +22,28 @@ class Heard(NamedTuple):
     Attributes:
         obs: The observation; valid are the channels that can be used.
         noise: Covariance ``(m, m)`` of its noise, the identity in the channels that are not.
-        flags: Sum of :class:`Flag`, for :func:`innovation_info`.
+        failed: Whether noise is not a number: the update then counts as failed.
+        flags: Sum of :class:`Flag`.
     """
 
     obs: Obs
     noise: Array
+    failed: Array
     flags: Array
+
+    def upon(self, info: Info) -> Info:
+        """Return the info of an update of what can be used with what could not be."""
+        likelihood = jnp.where(self.failed, -jnp.inf, info.log_likelihood)
+        return info._replace(log_likelihood=likelihood, flags=info.flags | self.flags)
 
 
 def heard(R: Array, obs: Obs) -> Heard:
     """Return the channels of an observation that can be used, and their noise.
 
-    A channel of infinite variance is missing; one of which the value is not finite, or the noise
-    not a number, is left out with a flag.
+    A channel of infinite variance is missing; one of which the value is not finite is left out with
+    a flag. Noise that is no covariance stays, with a flag. Where it is not a number the channel is
+    left out and the likelihood is that of a failed update: leaving it out alone would speak for a
+    member of a bank.
 
     Args:
         R: Covariance ``(m, m)`` or its diagonal ``(m,)``.
@@ -51,20 +60,26 @@ def heard(R: Array, obs: Obs) -> Heard:
         )
     variance = R if R.ndim == 1 else jnp.diag(R)
     known = obs.valid & (variance != jnp.inf)
-    broken = jnp.isnan(variance)
-    if not isinstance(obs, SureObs):
-        broken = broken | ~jnp.isfinite(obs.z)
-    valid = known & ~broken
+    broken = jnp.zeros(m, bool) if isinstance(obs, SureObs) else ~jnp.isfinite(obs.z)
+    unknown = jnp.isnan(variance)
+    if R.ndim == 2:
+        unknown = jnp.any(jnp.isnan(R) & known[:, None] & known[None], axis=1)
+    unknown = unknown & known & ~broken
+    valid = known & ~broken & ~unknown
     improper = valid & (variance < 0)
     if R.ndim == 2:
         # A pair's bound is taken in roots: a product of two variances can leave the range.
         sigma = jnp.sqrt(jnp.where(variance > 0, variance, 0))
         both = valid[:, None] & valid[None]
         slack = 1 + 1e3 * jnp.finfo(R.dtype).eps
-        beyond = ~(jnp.abs(R) <= slack * sigma[:, None] * sigma[None])
+        beyond = jnp.abs(R) > slack * sigma[:, None] * sigma[None]
         improper = improper | jnp.any(both & beyond, axis=1)
-    raised = {Flag.NOT_FINITE: jnp.any(known & broken), Flag.INVALID_NOISE: jnp.any(improper)}
-    return Heard(obs._replace(valid=valid), mask_noise(R, valid), flags_of(raised))
+    failed = jnp.any(unknown)
+    raised = {
+        Flag.NOT_FINITE: jnp.any(known & broken),
+        Flag.INVALID_NOISE: jnp.any(improper) | failed,
+    }
+    return Heard(obs._replace(valid=valid), mask_noise(R, valid), failed, flags_of(raised))
 
 
 def masked_innovation(model: Model, obs: Obs, z_pred: Array) -> Array:
@@ -177,11 +192,12 @@ def innovation_info(
         Flag.ILL_CONDITIONED: usable & few_digits,
         Flag.INDEFINITE: indefinite,
     }
-    return Info(
+    info = Info(
         innovation=nu,
         innovation_cov=S,
         log_likelihood=jnp.where(usable, log_likelihood, -jnp.inf),
         nis=nis,
         iterations=jnp.ones((), jnp.int32),
-        flags=told.flags | flags_of(raised),
+        flags=flags_of(raised),
     )
+    return told.upon(info)

@@ -20,6 +20,7 @@ from jaxnav.estimation.filters.innovation import (
     innovation_info,
     is_covariance,
     masked_innovation,
+    require_channels,
     require_step,
 )
 from jaxnav.estimation.filters.linearise import (
@@ -129,6 +130,7 @@ def ekf(model: Model) -> Filter:
     ) -> tuple[KalmanState, Info]:
         n = state.P.shape[0]
         z_pred, push = observation_map(model, params.model, state.x, u, n)
+        require_channels(obs, z_pred.shape)
         told = heard(model.observation_noise(params.model, state.x, u), obs)
         obs, R = told.obs, told.noise
         nu = masked_innovation(model, obs, z_pred)

@@ -151,7 +151,7 @@ def _reweighted(
         moved = jax.tree.map(lambda leaf: leaf[-1], states)
         info = jax.tree.map(lambda leaf: leaf[0], infos)
         flags = jax.lax.reduce(infos.flags, jnp.zeros((), jnp.int32), jax.lax.bitwise_or, (0,))
-        flags = flags | told.flags
-        return moved, info._replace(iterations=info.iterations + iterations, flags=flags)
+        info = info._replace(iterations=info.iterations + iterations, flags=flags)
+        return moved, told.upon(info)
 
     return base._replace(init=init, predict=predict, update=update, check=check)

@@ -187,7 +187,7 @@ def sage_husa(
         moved = state.log_factor
         if own.process != ():
             moved = moved_log_factor(own.process, moved, info, obs, smooth=smooth)
-        info = info._replace(flags=info.flags | heard_now.flags)
+        info = heard_now.upon(info)
         samples = state.samples + told.astype(state.samples.dtype)
         return SageHusaState(inner, noise, samples, moved), info
 

@@ -27,7 +27,7 @@ from jaxnav.estimation.filters.cloud import (
     without,
 )
 from jaxnav.estimation.filters.innovation import (
-    heard,
+    heard_by,
     innovation_info,
     is_covariance,
     masked_innovation,
@@ -215,7 +215,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         params: FilterParams, state: SigmaPointState, u: Input, obs: Obs
     ) -> tuple[SigmaPointState, Info]:
         rule = _rule(params, rule_of, state.P.shape[0])
-        told = heard(model.observation_noise(params.model, state.x, u), obs)
+        told = heard_by(model, params.model, state.x, u, obs)
         obs, R = told.obs, told.noise
         indefinite = state.indefinite
         cloud = state.points
@@ -273,7 +273,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         params: FilterParams, state: SquareRootSigmaPointState, u: Input, obs: Obs
     ) -> tuple[SquareRootSigmaPointState, Info]:
         rule = _rule(params, rule_of, state.L.shape[0])
-        told = heard(model.observation_noise(params.model, state.x, u), obs)
+        told = heard_by(model, params.model, state.x, u, obs)
         obs, R = told.obs, told.noise
         seen, nu = _observe(model, params, rule, state.x, drawn(rule, state.L), u, obs)
         seen = halves_of(seen)

@@ -12,6 +12,7 @@ from jaxnav.estimation.filters.innovation import (
     innovation_info,
     is_covariance,
     masked_innovation,
+    require_channels,
     require_step,
 )
 from jaxnav.estimation.filters.linearise import (
@@ -109,6 +110,7 @@ def square_root_ekf(model: Model) -> Filter:
         params: FilterParams, state: SquareRootState, u: Input, obs: Obs
     ) -> tuple[SquareRootState, Info]:
         z_pred, push = observation_map(model, params.model, state.x, u, state.L.shape[0])
+        require_channels(obs, z_pred.shape)
         told = heard(model.observation_noise(params.model, state.x, u), obs)
         obs, R = told.obs, told.noise
         nu = masked_innovation(model, obs, z_pred)

@@ -13,15 +13,8 @@ from jaxnav.datasets.base import DataError
 from jaxnav.datasets.rtklib import load_rtklib_pos
 from jaxnav.datasets.track import GnssTrack, gaps, intervals_s, thin
 from jaxnav.estimation.banks.mixture import BankParams, panel
-from jaxnav.estimation.banks.weights import (
-    WindowedReset,
-    bayes,
-    chain,
-    fixed,
-    floor,
-    markov,
-    windowed_reset,
-)
+from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.weights import bayes, chain, fixed, floor, markov
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.metrics import root
 from jaxnav.estimation.run import run

@@ -15,15 +15,8 @@ from jax import Array
 
 from jaxnav.compiling import host
 from jaxnav.estimation.banks.mixture import BankParams, PanelState, moment_match, panel
-from jaxnav.estimation.banks.weights import (
-    WindowedReset,
-    bayes,
-    chain,
-    fixed,
-    floor,
-    markov,
-    windowed_reset,
-)
+from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.weights import bayes, chain, fixed, floor, markov
 from jaxnav.estimation.bounds import oracle
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.metrics import nees

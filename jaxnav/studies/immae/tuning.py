@@ -10,15 +10,10 @@ import numpy as np
 from jax import Array
 
 from jaxnav.compiling import compiled
+from jaxnav.estimation.banks.log_weights import active
 from jaxnav.estimation.banks.mixture import BankParams, bank, panel
-from jaxnav.estimation.banks.weights import (
-    WindowedReset,
-    active,
-    bayes,
-    chain,
-    markov,
-    windowed_reset,
-)
+from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.weights import bayes, chain, markov
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run

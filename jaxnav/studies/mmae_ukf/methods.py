@@ -16,13 +16,8 @@ from jax import Array
 from jaxnav.compiling import host
 from jaxnav.estimation.banks.imm import imm, imm_params, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, moment_match, panel
-from jaxnav.estimation.banks.weights import (
-    WindowedReset,
-    bayes,
-    chain,
-    fixed,
-    windowed_reset,
-)
+from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.weights import bayes, chain, fixed
 from jaxnav.estimation.bounds import oracle
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sigma_point import ukf

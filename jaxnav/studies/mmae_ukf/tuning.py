@@ -12,7 +12,8 @@ from jax import Array
 
 from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, bank, panel
-from jaxnav.estimation.banks.weights import WindowedReset, bayes, chain, windowed_reset
+from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.weights import bayes, chain
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run

@@ -5,18 +5,20 @@ never come without one.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from car import AROUND, REVERSED, Leg, Sensed, Truth, drive, heading_error, logged
 
 from jaxnav.datasets.base import DataError
 from jaxnav.recorded.analysis import Report, analyse
 from jaxnav.recorded.config import FilterConfig
 from jaxnav.units import DEG
+from tests.faulty.car import AROUND, REVERSED, Leg, Sensed, Truth, drive, heading_error, logged
 
 CONFIG = FilterConfig(outages="off", rate_hz=10.0)
+also = partial(pytest.param, marks=pytest.mark.slow)
 METRE = 1 / 6.4e6
 """A metre north [rad]."""
 
@@ -157,7 +159,7 @@ def test_one_fix_that_is_off_changes_nothing(clean: Outcome, off: float) -> None
         assert np.max(np.abs(found.heading - clean.heading)) < 1 * DEG
 
 
-@pytest.mark.parametrize("heading", [40.0, 170.0, -95.0])
+@pytest.mark.parametrize("heading", [40.0, also(170.0), also(-95.0)])
 def test_reversing_before_the_drive_is_not_taken_for_its_direction(heading: float) -> None:
     found = outcome(*drive(REVERSED, seed=int(abs(heading)), heading_deg=heading))
     late = found.report.drive.time > 55
@@ -171,7 +173,7 @@ def straight(seconds: float) -> tuple[Leg, ...]:
     return (*start, *AROUND[3:]) if seconds < 100 else start
 
 
-@pytest.mark.parametrize("seconds", [30.0, 60.0, 120.0])
+@pytest.mark.parametrize("seconds", [30.0, also(60.0), also(120.0)])
 def test_a_straight_start_leaves_the_mounting_alone(seconds: float) -> None:
     """The error of the heading, which nothing has seen, is not taken for the mounting."""
     truth, sensed = drive(straight(seconds), seed=4)
@@ -187,7 +189,7 @@ def test_a_straight_start_leaves_the_mounting_alone(seconds: float) -> None:
     assert np.std(velocity[:, :2] - true[:, :2]) <= np.std(receiver)
 
 
-@pytest.mark.parametrize("speed", [5.0, 15.0, 30.0])
+@pytest.mark.parametrize("speed", [5.0, also(15.0), also(30.0)])
 def test_steady_motion_on_a_smooth_road_is_no_rest(speed: float) -> None:
     legs: tuple[Leg, ...] = ((10.0, 0.0, 0.0), (12.0, speed, 0.0), (90.0, speed, 0.0))
     truth, sensed = drive(legs, seed=2)
@@ -209,6 +211,7 @@ def test_positions_alone_are_enough() -> None:
     assert verdicts(found)["NIS, velocities"] == "not seen"
 
 
+@pytest.mark.slow
 def test_a_moving_start_with_a_manoeuvre_stays_honest() -> None:
     """The log begins in a bend: what the gyros turn is not taken for their drift."""
     truth, sensed = drive()

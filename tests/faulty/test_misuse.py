@@ -84,7 +84,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     "other steps": (filtered(u=jnp.zeros((5, 1))), r"have \[4, 5\] steps"),
     "another number of channels": (
         filtered(z=jn.Obs(jnp.zeros((STEPS, 3)), jnp.ones((STEPS, 3), bool))),
-        r"observation noise is \(2,\) and the observation has 3 channels",
+        r"the observation has z \(3,\) .* the model observes \(2,\)",
     ),
     "parameters of a bank": (
         filtered(jn.BankParams(MEMBERS, ())),
