@@ -20,6 +20,12 @@ ROUNDING = 1e-6
 """Relative asymmetry, and share of the variances by which an eigenvalue may be negative."""
 
 
+Domain = tuple[str, float, float]
+POSITIVE: Domain = ("(0, inf]", 0.0, np.inf)
+NOT_NEGATIVE: Domain = ("[0, inf)", 0.0, np.inf)
+"""Domains of :func:`require_number`: an interval in words, its lower and its upper end."""
+
+
 def described(value: Any) -> str:
     """Return what a value is, for a message: an array by its shape and type, others by class."""
     if isinstance(value, jax.Array | np.ndarray | np.generic):
@@ -119,12 +125,6 @@ def require_covariance(name: str, value: Any) -> None:
         )
 
 
-POSITIVE = ("(0, inf]", 0.0, np.inf)
-NOT_NEGATIVE = ("[0, inf)", 0.0, np.inf)
-NUMBER = ("(-inf, inf)", -np.inf, np.inf)
-"""Domains of :func:`require_number`: an interval in words, its lower and its upper end."""
-
-
 def require_members(check: Any, members: Any) -> int:
     """Raise ``ValueError`` unless parameters have a leading model axis; return its length.
 
@@ -206,7 +206,7 @@ def require_number(name: str, value: Any, domain: str, low: float, high: float) 
         raise ValueError(f"{name} is {given:g}; it must be in {domain}")
 
 
-def require_fields(name: str, value: Any, kind: type, domains: Mapping[str, tuple]) -> None:
+def require_fields(name: str, value: Any, kind: type, domains: Mapping[str, Domain]) -> None:
     """Raise ``ValueError`` unless a value is of a class and its fields are within their domains.
 
     Args:
@@ -221,7 +221,9 @@ def require_fields(name: str, value: Any, kind: type, domains: Mapping[str, tupl
         require_number(f"{field} of {kind.__name__}", getattr(value, field), *domain)
 
 
-def require_part(params: FilterParams, part: str, kind: type, domains: Mapping[str, tuple]) -> None:
+def require_part(
+    params: FilterParams, part: str, kind: type, domains: Mapping[str, Domain]
+) -> None:
     """Raise ``ValueError`` unless a part of a filter's parameters is its own, or ``()``.
 
     Args:

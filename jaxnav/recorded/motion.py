@@ -104,7 +104,7 @@ def seen_moving(
     known = np.flatnonzero(np.isfinite(speed))
     if not len(known):
         return np.zeros(len(time), bool)
-    sigma = np.array([speed_sigma(fixes, i) for i in known])
+    sigma = np.array([speed_sigma(fixes, int(i)) for i in known])
     after = np.clip(np.searchsorted(fix_time[known], time), 0, len(known) - 1)
     before = np.maximum(after - 1, 0)
     earlier = time - fix_time[known[before]] < fix_time[known[after]] - time

@@ -62,13 +62,13 @@ def steps() -> Step:
 
 def observations() -> jn.Obs:
     z = np.random.default_rng(0).normal(size=(STEPS, 2))
-    return jn.Obs(z, np.ones((STEPS, 2), bool))
+    return jn.Obs(jnp.asarray(z), jnp.ones((STEPS, 2), bool))
 
 
 def without(obs: jn.Obs) -> jn.Obs:
     valid = np.array(obs.valid)
     valid[ONE, 1] = valid[ALL] = False
-    return obs._replace(valid=valid)
+    return obs._replace(valid=jnp.asarray(valid))
 
 
 @partial(compiled, static_argnums=0)
@@ -106,7 +106,7 @@ def test_what_cannot_be_used_is_left_out_and_told(name: str) -> None:
         [
             (params, inputs, without(obs)),
             (params, infinite, obs),
-            (params, inputs, obs._replace(z=lost)),
+            (params, inputs, obs._replace(z=jnp.asarray(lost))),
             (params, inputs, obs),
         ],
     )

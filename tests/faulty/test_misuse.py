@@ -16,6 +16,7 @@ from jaxnav.estimation.filters.robust import Versoria
 from jaxnav.estimation.filters.sage_husa import SageHusa
 
 STEPS = 4
+LISTED: Any = [[0.0, 0.0]] * STEPS
 INSIDE = re.compile(r"tracer|jvp|vmap|\bzip\b|has no attribute|Traced<|NoneType", re.IGNORECASE)
 """Words of JAX and Python that mean nothing to the caller."""
 
@@ -70,7 +71,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a list for observations": (filtered(z=[1.0, 2.0]), r"^observations is a list; it must be Obs"),
     "a list for z": (
-        filtered(z=jn.Obs([[0.0, 0.0]] * STEPS, jnp.ones((STEPS, 2), bool))),
+        filtered(z=Z._replace(z=LISTED)),
         r"^observations\.z is a list; it must be an array$",
     ),
     "one channel without its axis": (

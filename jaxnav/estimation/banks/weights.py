@@ -144,8 +144,12 @@ def penalty() -> WeightRule:
 
 def _check_penalty(params: Penalty, count: int) -> None:
     del count
-    domains = dict.fromkeys(("scale", "least", "normaliser"), NOT_NEGATIVE)
-    domains["memory"] = POSITIVE
+    domains = {
+        "scale": NOT_NEGATIVE,
+        "least": NOT_NEGATIVE,
+        "normaliser": NOT_NEGATIVE,
+        "memory": POSITIVE,
+    }
     require_fields("the parameter of penalty", params, Penalty, domains)
 
 

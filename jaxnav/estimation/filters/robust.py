@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import NOT_NEGATIVE, POSITIVE, require_part
+from jaxnav.estimation.checks import NOT_NEGATIVE, POSITIVE, Domain, require_part
 from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
 from jaxnav.estimation.filters.innovation import heard_by, masked_innovation
 from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
@@ -109,7 +109,7 @@ def _reweighted(
     model: Model,
     weight: Callable[[Any, Array], Array],
     default: Any,
-    domains: dict[str, tuple],
+    domains: dict[str, Domain],
     iterations: int,
 ) -> Filter:
     """Return a filter whose update is made anew with weights from its own residuals.
