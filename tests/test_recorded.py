@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from checks import outlying_fixes
 from jaxnav.cli import main
 from jaxnav.compiling import compiled
 from jaxnav.datasets.base import DataError
@@ -438,3 +439,17 @@ def test_rtk_drive_tells_its_time_offset() -> None:
 
 def test_horizontal_is_the_distance_in_the_plane() -> None:
     np.testing.assert_array_equal(horizontal(np.array([[3.0, 4.0, 9.0]])), [5.0])
+
+
+@pytest.mark.slow
+def test_one_fix_that_is_off_leaves_the_recorded_drive_alone() -> None:
+    """A sample of ``checks/outlying_fixes.py``: four of its eighty cases for the ekf."""
+    log = recorded("rtk_drive")
+    config = FilterConfig(outages="off", rate_hz=25.0)
+    clean = analyse(log, config)
+    assert clean.document["refused"] == []
+    for i, off in outlying_fixes.FEW:
+        fix = int(outlying_fixes.places(clean.drive)[i])
+        report = analyse(outlying_fixes.moved(log, fix, off), config)
+        found = outlying_fixes.compared(clean, report, fix)
+        assert outlying_fixes.good(found), (fix, off, found)
