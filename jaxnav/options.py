@@ -138,7 +138,10 @@ def _sentence(box: str, program: str) -> str:
     """Return the message inside tyro's error box as one sentence."""
     lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()]
     body = [line for line in lines if line][1:]
-    end = next((i for i, line in enumerate(body) if set(line) == {"─"}), len(body))
+    # On a terminal without box characters the title has a rule of hyphens under it.
+    rules = [i for i, line in enumerate(body) if set(line) <= set("─-")]
+    body = body[1:] if rules[:1] == [0] else body
+    end = next((i for i, line in enumerate(body) if set(line) <= set("─-")), len(body))
     text = " ".join(body[:end]).rstrip(".")
     flag = re.match(r"Error parsing (--[\w-]+): .*?'([^']*)'$", text)
     if flag:

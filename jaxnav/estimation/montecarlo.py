@@ -108,6 +108,9 @@ def monte_carlo(
     for name, value in (("runs", runs), ("tile", tile), ("threads", threads)):
         if not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} is {value}; it must be a whole number of at least 1")
+    most = np.iinfo(np.int32).max - tile
+    if runs > most:
+        raise ValueError(f"runs is {runs}; it must be at most {most}")
     starts = range(0, runs, tile)
     inputs = [jax.device_put((key, jnp.int32(runs), shared), device) for device in chosen]
     free: SimpleQueue[Any] = SimpleQueue()

@@ -20,6 +20,8 @@ from jaxnav.recorded.motion import seen_moving, since_start, still_samples, velo
 from jaxnav.recorded.start import initial, start_of
 
 CHANNELS = FIXES.stop + len(CONSTRAINTS)
+FASTER = 1.5
+"""How many times faster than its samples a filter may be asked to run: a rate told roughly."""
 BRIDGED_S = 60.0
 """Longest time without inertial samples that a filter is taken over."""
 
@@ -78,6 +80,11 @@ def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -
     fix_time = since_start(log.fixes.time_ns, log) + config.time_offset_s
     still = still_samples(log.imu, config)
     start = start_of(log, config, time, fix_time, still)
+    if rate_hz is not None and rate_hz * log.imu.step_s > FASTER:
+        raise DataError(
+            f"{log.source}: rate_hz is {rate_hz:g} and the inertial samples come at "
+            f"{1 / log.imu.step_s:.4g} Hz; accepted is a rate up to theirs"
+        )
     every = 1 if rate_hz is None else max(1, round(1 / (rate_hz * log.imu.step_s)))
     ends = np.arange(start.sample + every, len(time), every)
     if len(ends) < 2:

@@ -7,6 +7,9 @@ from functools import partial
 from types import NoneType
 from typing import Any, get_args
 
+MOST_RUNS = 10**9
+"""Most runs of a study, whose rows are all kept."""
+
 
 class ConfigError(ValueError):
     """A parameter outside what is accepted; the message says which, its value and the range."""
@@ -40,7 +43,7 @@ def require_positive(config: Any, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
         entries = value if isinstance(value, tuple) else (value,)
-        accepted = "positive in one entry or more" if isinstance(value, tuple) else "positive"
+        accepted = "one positive number or more" if isinstance(value, tuple) else "positive"
         good = len(entries) > 0 and all(0 < entry < float("inf") for entry in entries)
         require(good, name, value, accepted)
 
@@ -55,7 +58,7 @@ def require_finite(config: Any) -> None:
 
 def require_runs(config: Any) -> None:
     """Require that ``runs`` and ``seed`` make a Monte Carlo study."""
-    require(config.runs >= 1, "runs", config.runs, "at least 1")
+    require(1 <= config.runs <= MOST_RUNS, "runs", config.runs, f"from 1 to {MOST_RUNS}")
     require(0 <= config.seed < 2**63, "seed", config.seed, "between 0 and 2**63 - 1")
 
 

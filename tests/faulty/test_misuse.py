@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxnav as jn
+from jaxnav.cli import main
 from jaxnav.estimation.banks.weights import Floor, switch
 from jaxnav.estimation.filters.adaptive import Adaptation
 from jaxnav.estimation.filters.robust import Versoria
@@ -311,3 +312,24 @@ def test_the_package_lists_itself() -> None:
     assert "get_close_matches" not in dir(jn)
     assert re.fullmatch(r"\d+\.\d+\.\d+.*", jn.__version__)
     assert np.all([getattr(jn, name) is not None for name in jn.__all__])
+
+
+WORDS = {
+    "run immae --theta 1 -5": "theta is (1.0, -5.0); it must be one positive number or more",
+    "run immae --runs abc": "--runs is 'abc'; it must be of type INT",
+    "run immae --runs 1000000000000": "runs is 1000000000000; it must be from 1 to 1000000000",
+    "run immae --nope 3": (
+        "unrecognized options: --nope, 3; `jaxnav run immae --help` lists what is accepted"
+    ),
+    "tune gnss-track": "log is not given; it must be the path of an RTKLIB .pos file",
+}
+
+
+@pytest.mark.parametrize("command", WORDS)
+def test_the_command_line_says_it_in_one_sentence(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The parser's message comes in a drawn box, of which nothing may be left."""
+    assert main(command.split()) == 2
+    said = capsys.readouterr().err
+    assert said == f"jaxnav: {WORDS[command]}\n"

@@ -95,7 +95,7 @@ def load(config: GnssTrackConfig) -> GnssTrack:
     """Return the track of a configuration; raises as :func:`run_study` does."""
     require_x64()
     if config.log is None:
-        raise ConfigError("log is not given; it must be the path of an RTKLIB .pos file (--log)")
+        raise ConfigError("log is not given; it must be the path of an RTKLIB .pos file")
     return load_rtklib_pos(config.log)
 
 
