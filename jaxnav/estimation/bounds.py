@@ -18,6 +18,7 @@ from jaxnav.estimation.types import (
     Obs,
     Params,
     Point,
+    accept,
 )
 from jaxnav.numerics.linalg import matmul
 
@@ -42,7 +43,8 @@ def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filte
     def update(params: Params, state: Any, u: Input, obs: Obs) -> tuple[Any, Any]:
         return filter.update(informed(params, u), state, u, obs)
 
-    return filter._replace(predict=predict, update=update)
+    # What is told may be of any kind: the parameters need no more than the filter's prior.
+    return filter._replace(predict=predict, update=update, check=accept)
 
 
 def linearised_at_truth(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> Filter:

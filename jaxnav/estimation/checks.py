@@ -76,7 +76,11 @@ def require_filter_params(model: Model, params: Any) -> None:
         raise ValueError(
             f"params is {described(params)}; a single filter takes FilterParams(model, initial)"
         )
-    initial = params.initial
+    require_prior(model, params.initial)
+
+
+def require_prior(model: Model, initial: Any) -> None:
+    """Raise ``ValueError`` unless a prior is a Gaussian on a model's manifold."""
     if not isinstance(initial, Gaussian):
         raise ValueError(f"initial is {described(initial)}; it must be Gaussian(mean, cov)")
     leaves = jax.tree.leaves(initial.mean, is_leaf=lambda node: isinstance(node, list))

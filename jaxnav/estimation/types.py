@@ -180,7 +180,8 @@ class Model(NamedTuple):
     noisy: NonAdditive | None = None
 
 
-def _anything(*given: Any) -> None:
+def accept(*given: Any) -> None:
+    """Take any parameters: the check of a filter or rule that has none."""
     del given
 
 
@@ -265,7 +266,7 @@ class Filter(NamedTuple):
     restart: Callable[[Any, Gaussian], Any]
     retract: Callable[[Point, Array], Point] = add
     local: Callable[[Point, Point], Array] = subtract
-    check: Callable[[Params], None] = _anything
+    check: Callable[[Params], None] = accept
 
 
 class WeightPredict(Protocol):
@@ -301,7 +302,7 @@ class WeightRule(NamedTuple):
     init: Callable[[Params, Array], Any]
     predict: WeightPredict
     update: WeightUpdate
-    check: Callable[[Params, int], None] = _anything
+    check: Callable[[Params, int], None] = accept
 
 
 def observed(z: Array) -> Obs:

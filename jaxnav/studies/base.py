@@ -58,7 +58,9 @@ def require_finite(config: Any) -> None:
 
 def require_runs(config: Any) -> None:
     """Require that ``runs`` and ``seed`` make a Monte Carlo study."""
-    require(1 <= config.runs <= MOST_RUNS, "runs", config.runs, f"from 1 to {MOST_RUNS}")
+    require(
+        1 <= config.runs <= MOST_RUNS, "runs", config.runs, f"at least 1 and at most {MOST_RUNS}"
+    )
     require(0 <= config.seed < 2**63, "seed", config.seed, "between 0 and 2**63 - 1")
 
 

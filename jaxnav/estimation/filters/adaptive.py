@@ -99,7 +99,6 @@ def innovation_adaptive(
         require_part(params, "adaptation", Adaptation, ADAPTATION_DOMAINS)
 
     def init(params: FilterParams) -> AdaptiveState:
-        check(params)
         return AdaptiveState(base.init(params), jnp.zeros((), params.initial.cov.dtype))
 
     def predict(params: FilterParams, state: AdaptiveState, u: Input) -> AdaptiveState:

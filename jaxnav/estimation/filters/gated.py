@@ -79,7 +79,6 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
         filter.check(params.inner)
 
     def init(params: Gated) -> GatedState:
-        check(params)
         return GatedState(filter.init(params.inner), jnp.zeros(len(groups), jnp.int32))
 
     def predict(params: Gated, state: GatedState, u: Input) -> GatedState:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.ad_checkpoint import checkpoint_name
 
-from jaxnav.estimation.checks import require_filter_params
+from jaxnav.estimation.checks import require_filter_params, require_prior
 from jaxnav.estimation.filters.innovation import (
     heard,
     innovation_info,
@@ -112,7 +112,7 @@ def ekf(model: Model) -> Filter:
     check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> KalmanState:
-        check(params)
+        require_prior(model, params.initial)
         return KalmanState(*params.initial, ~is_covariance(params.initial.cov))
 
     def predict(params: FilterParams, state: KalmanState, u: Input) -> KalmanState:

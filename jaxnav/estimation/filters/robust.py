@@ -126,10 +126,6 @@ def _reweighted(
         base.check(params)
         require_part(params, "kernel", type(default), domains)
 
-    def init(params: FilterParams) -> Any:
-        check(params)
-        return base.init(params)
-
     def predict(params: FilterParams, state: Any, u: Input) -> Any:
         return base.predict(given(params, 1.0, 0.0), state, u)
 
@@ -154,4 +150,4 @@ def _reweighted(
         info = info._replace(iterations=info.iterations + iterations, flags=flags)
         return moved, told.upon(info)
 
-    return base._replace(init=init, predict=predict, update=update, check=check)
+    return base._replace(predict=predict, update=update, check=check)

@@ -141,7 +141,6 @@ def sage_husa(
             require_fields("process of SageHusa", process, Adaptation, ADAPTATION_DOMAINS)
 
     def init(params: FilterParams) -> SageHusaState:
-        check(params)
         dtype = params.initial.cov.dtype
         unit, none = jnp.eye(channels, dtype=dtype), jnp.zeros((channels,), dtype)
         return SageHusaState(base.init(params), unit, none, jnp.zeros((), dtype))

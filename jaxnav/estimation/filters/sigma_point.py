@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import require_filter_params
+from jaxnav.estimation.checks import require_filter_params, require_prior
 from jaxnav.estimation.filters.cloud import (
     Cloud,
     centre_column,
@@ -195,7 +195,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
     check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> SigmaPointState:
-        check(params)
+        require_prior(model, params.initial)
         rule = _rule(params, rule_of, params.initial.cov.shape[0])
         x, P = params.initial
         points = () if redraw else drawn(rule, semidefinite_root(P).factor)
@@ -249,7 +249,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
     check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> SquareRootSigmaPointState:
-        check(params)
+        require_prior(model, params.initial)
         _rule(params, rule_of, params.initial.cov.shape[0])
         x, P = params.initial
         return SquareRootSigmaPointState(x, semidefinite_root(P).factor, ~is_covariance(P))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import require_filter_params
+from jaxnav.estimation.checks import require_filter_params, require_prior
 from jaxnav.estimation.filters.innovation import (
     heard,
     innovation_info,
@@ -94,7 +94,7 @@ def square_root_ekf(model: Model) -> Filter:
     check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> SquareRootState:
-        check(params)
+        require_prior(model, params.initial)
         x, P = params.initial
         return SquareRootState(x, semidefinite_root(P).factor, ~is_covariance(P))
 
