@@ -317,7 +317,9 @@ def test_the_package_lists_itself() -> None:
 WORDS = {
     "run immae --theta 1 -5": "theta is (1.0, -5.0); it must be one positive number or more",
     "run immae --runs abc": "--runs is 'abc'; it must be of type INT",
-    "run immae --runs 1000000000000": "runs is 1000000000000; it must be at least 1 and at most 1000000000",
+    "run immae --runs 1000000000000": (
+        "runs is 1000000000000; it must be at least 1 and at most 1000000000"
+    ),
     "run immae --nope 3": (
         "unrecognized options: --nope, 3; `jaxnav run immae --help` lists what is accepted"
     ),
