@@ -778,7 +778,7 @@ def test_flags(name: str) -> None:
     assert flags[0] == 0
     assert flags[1] == Flag.NO_OBSERVATION
     assert flags[2] == Flag.INDEFINITE
-    assert flags[3] == Flag.NOT_POSITIVE_DEFINITE
+    assert flags[3] == Flag.NOT_POSITIVE_DEFINITE | Flag.INVALID_NOISE
     assert np.all(np.isfinite(found.mean[:3]))
     assert np.linalg.eigvalsh(found.cov[:3]).min() > -1e-12
     np.testing.assert_array_equal(found.mean[1], params.initial.mean[1])

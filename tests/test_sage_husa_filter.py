@@ -359,7 +359,7 @@ def test_dtype_in_is_dtype_out(name: str) -> None:
     for own in (arrays, SageHusa(), ()):
         shaped = jax.eval_shape(step, one._replace(adaptation=own), obs)
         for leaf in jax.tree.leaves(shaped):
-            assert leaf.dtype in (jnp.float32, jnp.int32), leaf
+            assert leaf.dtype in (jnp.float32, jnp.int32, jnp.bool_), leaf
 
 
 def test_share_of_a_sample() -> None:

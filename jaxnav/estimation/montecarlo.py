@@ -107,7 +107,7 @@ def monte_carlo(
         threads = max(cores() // len(chosen), 1) if on_cpu else 1
     for name, value in (("runs", runs), ("tile", tile), ("threads", threads)):
         if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name} is {value}; it must be a whole number of at least 1")
+            raise ValueError(f"{name} is {value}; it must be at least 1, and whole")
     most = np.iinfo(np.int32).max - tile
     if runs > most:
         raise ValueError(f"runs is {runs}; it must be at most {most}")

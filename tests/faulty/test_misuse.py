@@ -267,8 +267,11 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         study(key=jax.random.split(jax.random.key(0), 3)),
         r"^key is an array \(3,\) of key<fry>; it must be one key",
     ),
-    "runs that are not whole": (study(runs=2.5), r"^runs is 2\.5; it must be a whole number"),
-    "no runs": (study(runs=0), r"^runs is 0; it must be a whole number of at least 1$"),
+    "runs that are not whole": (
+        study(runs=2.5),
+        r"^runs is 2\.5; it must be at least 1, and whole$",
+    ),
+    "no runs": (study(runs=0), r"^runs is 0; it must be at least 1, and whole$"),
     "a run without RunOutput": (
         study(lambda key, shared: jnp.zeros(2)),
         r"^run_one returns an array \(8, 2\) of float64; it must return RunOutput\(row\)",
