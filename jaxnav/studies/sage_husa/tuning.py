@@ -165,7 +165,9 @@ def _member_params(
     size = len(config.grid)
     model, law = jax.tree.map(lambda leaf: leaf[:size], members)
     law = law._replace(forgetting=jnp.repeat(forgetting, len(config.q_scales)))
-    return FilterParams(model, replicate(start, size), adaptation=law)
+    own = FilterParams(model, replicate(start, size), adaptation=law)
+    # A function with a derivative of its own takes no NumPy arrays from a vmap inside a jit.
+    return jax.tree.map(jnp.asarray, own)
 
 
 def _rule_params(values: Values, smooth: bool) -> Any:
