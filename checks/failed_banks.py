@@ -4,7 +4,7 @@ Usage: python checks/failed_banks.py
 
 The bank's members have a factor on their noise that is negative where they fail, and the descent is
 free to go there. Every start must be refused, or end where the score is finite. Writes
-``failed_banks.json`` beside this script; the exit code is 1 if one ended in failure. Takes two
+``failed_banks.json`` beside this script; the exit code is 1 if one ended in failure. Takes five
 minutes on two cores.
 """
 
