@@ -84,6 +84,9 @@ if TYPE_CHECKING:
     from jaxnav.estimation.filters.adaptive import (
         innovation_adaptive as innovation_adaptive,
     )
+    from jaxnav.estimation.filters.gated import Gate as Gate
+    from jaxnav.estimation.filters.gated import Gated as Gated
+    from jaxnav.estimation.filters.gated import gated as gated
     from jaxnav.estimation.filters.iterated import (
         iterated_ckf as iterated_ckf,
     )
@@ -166,6 +169,7 @@ _HOMES = {
     "jaxnav.estimation.banks.reset": ("WindowedReset", "windowed_reset"),
     "jaxnav.estimation.bounds": ("linearised_at_truth", "oracle"),
     "jaxnav.estimation.filters.adaptive": ("innovation_adaptive",),
+    "jaxnav.estimation.filters.gated": ("Gate", "Gated", "gated"),
     "jaxnav.estimation.filters.iterated": (
         "iterated_ckf",
         "iterated_ekf",

@@ -273,7 +273,8 @@ def print_filter(document: dict[str, Any], directory: Path, figures: list[Path])
     console.print(
         f"{counts['samples']} samples at {1 / counts['sample_s']:.4g} Hz "
         f"({counts['skipped_rows']} rows skipped, {counts['nan_rows']} with an entry that is no "
-        f"number, {counts['gaps']} gaps); {counts['fixes_used']} of {counts['fixes']} fixes used; "
+        f"number, {counts['gaps']} gaps); {counts['fixes_used']} of {counts['fixes']} fixes used "
+        f"({counts['fixes_without_solution']} more had no solution); "
         f"aligned {'at rest' if start['kind'] == 'rest' else 'on the move'} until "
         f"{start['end_s']:.4g} s; fixes moved by {document['time_offset']['used_s']:.4g} s",
         soft_wrap=True,

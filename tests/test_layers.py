@@ -39,7 +39,6 @@ ORDER = (
     "estimation.banks.log_weights",
     "estimation.banks.weights",
     "estimation.banks.reset",
-    "estimation.banks.rules",
     "estimation.banks.mixture",
     "estimation.banks.imm",
     "estimation.run",

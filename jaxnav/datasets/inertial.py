@@ -46,7 +46,7 @@ class ImuLog(NamedTuple):
         step_s: Sampling interval [s], the mean of the intervals that are no gaps: time stamps in
             whole milliseconds have a median interval that is wrong by percents.
         duplicates: Rows dropped because they repeat the time before.
-        nan_rows: Rows with an entry that is empty, not a number or infinite.
+        nan_rows: Rows with an entry that is empty, not a number, infinite or cut off.
         gaps: Intervals above one and a half median intervals.
         missing: Samples that those intervals lack.
         source: Path of the file.
@@ -80,7 +80,8 @@ def load_imu_csv(path: str | Path) -> ImuLog:
     """
     table = read_table(Path(path), SENSOR_UNITS, _ACCEPTED)
     values = np.stack([table.columns[name] for name in SENSORS], axis=1)
-    return assemble(table.time_ns, values, str(path))
+    log = assemble(table.time_ns, values, str(path))
+    return log._replace(nan_rows=log.nan_rows + table.cut)
 
 
 def assemble(time_ns: NDArray[np.int64], values: NDArray[np.float64], source: str) -> ImuLog:

@@ -6,9 +6,10 @@ Knows nothing of navigation: a state-space model from any field is a :class:`~.t
 
 def catalogue() -> dict[str, dict[str, str]]:
     """Return the filters, banks and weight rules with the first line of their documentation."""
-    from jaxnav.estimation.banks import imm, mixture, rules
+    from jaxnav.estimation.banks import imm, mixture, reset, weights
     from jaxnav.estimation.filters import (
         adaptive,
+        gated,
         iterated,
         kalman,
         robust,
@@ -34,9 +35,20 @@ def catalogue() -> dict[str, dict[str, str]]:
             robust.correntropy,
             adaptive.innovation_adaptive,
             sage_husa.sage_husa,
+            gated.gated,
         ),
         "banks": (mixture.bank, mixture.mmae, mixture.immae, imm.imm, mixture.panel),
-        "weight rules": tuple(rules.RULES.values()),
+        "weight rules": (
+            weights.fixed,
+            weights.bayes,
+            weights.penalty,
+            weights.floor,
+            weights.forget,
+            weights.markov,
+            weights.switch,
+            reset.windowed_reset,
+            weights.chain,
+        ),
     }
     return {
         title: {entry.__name__: (entry.__doc__ or "").splitlines()[0] for entry in entries}

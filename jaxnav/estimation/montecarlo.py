@@ -181,12 +181,17 @@ def _run_tile(
     """Compute the tile of runs from ``start``."""
     indices = start + jnp.arange(tile, dtype=jnp.int32)
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
-    output = jax.vmap(run_one, in_axes=(0, None))(keys, shared)
-    if not isinstance(output, RunOutput):
-        raise ValueError(
-            f"run_one returns {described(output)}; it must return RunOutput(row), with numbers and "
-            "small arrays as the row"
-        )
+
+    def one(key: Array, shared: Any) -> RunOutput:
+        output = run_one(key, shared)
+        if not isinstance(output, RunOutput):
+            raise ValueError(
+                f"run_one returns {described(output)}; it must return RunOutput(row), with numbers "
+                "and small arrays as the row"
+            )
+        return output
+
+    output = jax.vmap(one, in_axes=(0, None))(keys, shared)
     finite = jax.vmap(_all_finite)(output.row)
     counted = finite & (indices < runs)
 

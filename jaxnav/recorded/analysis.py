@@ -23,6 +23,7 @@ from jaxnav.recorded.experiments import (
 )
 from jaxnav.recorded.findings import document_of, faults
 from jaxnav.recorded.methods import Kept, Method, filter_params, member_names, method
+from jaxnav.recorded.motion import since_start
 from jaxnav.recorded.offset import Offset, likeliest_offset
 from jaxnav.recorded.preparation import Drive, prepare
 from jaxnav.recorded.scoring import (
@@ -182,7 +183,7 @@ def _refused(log: DriveLog, drive: Drive, kept: Kept) -> list[dict[str, Any]]:
     """Return the fixes that the gate refused: their number in the log, from 1, and their time."""
     flags = np.asarray(kept.flags)[drive.fix_step]
     refused = np.flatnonzero(flags & Flag.REFUSED)
-    since = (log.fixes.time_ns - log.imu.time_ns[0]) / 1e9
+    since = since_start(log.fixes.time_ns, log)
     return [{"fix": int(drive.fix[i]) + 1, "time_s": float(since[drive.fix[i]])} for i in refused]
 
 

@@ -15,7 +15,7 @@ from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Flag
 from jaxnav.recorded.findings import Finding, judged
 from jaxnav.recorded.methods import Kept
-from jaxnav.recorded.motion import course_velocity
+from jaxnav.recorded.motion import course_velocity, runs_of, since_start
 from jaxnav.recorded.preparation import Drive
 from jaxnav.units import DEG
 
@@ -24,6 +24,8 @@ SPAN_S = 1.0
 """Turns of the course and of the gyros are compared over so long, on a grid."""
 LAGS_S = 30.0
 """Largest offset between the clocks that is looked for."""
+LEAST_POINTS = 20
+"""Points of two series that are compared at least."""
 LEAST_TURN = 3 * DEG
 """Root mean square of the turn rate [rad/s] that a course must show to be compared at all."""
 COURSE_SPEED = 3.0
@@ -50,8 +52,7 @@ def audit(log: DriveLog, drive: Drive, kept: Kept) -> list[Finding]:
 
 def _longest_run(same: np.ndarray) -> tuple[int, int]:
     """Return the length of the longest run of True and where it begins."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    runs = edges.reshape(-1, 2)
+    runs = runs_of(same)
     if not len(runs):
         return 0, 0
     lengths = runs[:, 1] - runs[:, 0]
@@ -64,7 +65,7 @@ def _samples(log: DriveLog) -> list[Finding]:
     values = np.hstack([log.imu.gyro, log.imu.accel])
     same = np.all(values[1:] == values[:-1], axis=1) & log.imu.valid[1:] & log.imu.valid[:-1]
     length, begin = _longest_run(same)
-    since = (log.imu.time_ns[begin] - log.imu.time_ns[0]) / 1e9
+    since = float(since_start(log.imu.time_ns[begin], log))
     lasted = length * log.imu.step_s
     repeated = judged(
         "repeated samples",
@@ -104,7 +105,7 @@ def _samples(log: DriveLog) -> list[Finding]:
 
 def _receiver(log: DriveLog, drive: Drive) -> list[Finding]:
     """Judge the fixes by themselves: a receiver that goes on saying the same."""
-    place, time = log.fixes.geodetic, (log.fixes.time_ns - log.imu.time_ns[0]) / 1e9
+    place, time = log.fixes.geodetic, since_start(log.fixes.time_ns, log)
     same = np.all(place[1:] == place[:-1], axis=1)
     at = np.clip(np.searchsorted(drive.time, time[1:]), 0, len(drive.time) - 1)
     length, begin = _longest_run(same & ~drive.stopped[at])
@@ -130,7 +131,7 @@ class _Turns(NamedTuple):
 
 
 def _turns(log: DriveLog, drive: Drive) -> _Turns:
-    time = (log.imu.time_ns - log.imu.time_ns[0]) / 1e9
+    time = since_start(log.imu.time_ns, log)
     grid = np.arange(time[0], time[-1], GRID_S)
     rate = np.where(log.imu.valid, log.imu.gyro[:, 2], 0.0)
     angle = np.concatenate([[0.0], np.cumsum(rate[1:] * np.diff(time))])
@@ -140,7 +141,7 @@ def _turns(log: DriveLog, drive: Drive) -> _Turns:
     fast = speed > COURSE_SPEED
     course = np.full(len(grid), np.nan)
     if fast.sum() > 2:
-        fix_time = (log.fixes.time_ns - log.imu.time_ns[0]) / 1e9 + drive.offset_s
+        fix_time = since_start(log.fixes.time_ns, log) + drive.offset_s
         left = np.unwrap(-np.arctan2(velocity[fast, 0], velocity[fast, 1]))
         course = np.interp(grid, fix_time[fast], left, left=np.nan, right=np.nan)
         # Between fast fixes that are far apart nothing is known.
@@ -159,19 +160,25 @@ def _turns(log: DriveLog, drive: Drive) -> _Turns:
     return _Turns(rates, gyro - np.median(gyro))
 
 
-def _matched(a: np.ndarray, b: np.ndarray, lag: int) -> tuple[float, float]:
-    """Return correlation, and slope of ``b`` over ``a``, with ``a`` taken so many points later."""
+def _matched(
+    a: np.ndarray, b: np.ndarray, lag: int = 0, least: int = LEAST_POINTS
+) -> tuple[float, float]:
+    """Return correlation, and slope of ``b`` over ``a``, with ``a`` taken so many points later.
+
+    Fewer than ``least`` points in common tell nothing: a correlation of 0.
+    """
     if lag >= 0:
         a, b = a[lag:], b[: len(b) - lag]
     else:
         a, b = a[:lag], b[-lag:]
     known = np.isfinite(a) & np.isfinite(b)
-    if known.sum() < 100:
+    if known.sum() < least:
         return 0.0, math.nan
     a, b = a[known] - a[known].mean(), b[known] - b[known].mean()
     both = float(a @ b)
     size = math.sqrt(float(a @ a) * float(b @ b))
-    return (both / size if size > 0 else 0.0), float(b @ b) / both if both else math.nan
+    correlation = both / size if size > 0 else 0.0
+    return min(1.0, max(-1.0, correlation)), float(b @ b) / both if both else math.nan
 
 
 def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
@@ -182,16 +189,16 @@ def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
     if known.sum() < 200 or np.sqrt(np.mean(course[known] ** 2)) < LEAST_TURN:
         return [Finding(name, "not seen", math.nan, (0.0, 0.0), "") for name in names]
     most = min(round(LAGS_S / GRID_S), len(course) // 3)
-    lags = np.arange(-most, most + 1)
-    found = np.array([_matched(course, gyro, int(lag))[0] for lag in lags])
+    lags, enough = np.arange(-most, most + 1), int(known.sum()) // 2
+    found = np.array([_matched(course, gyro, int(lag), enough)[0] for lag in lags])
     best = int(np.argmax(np.abs(found)))
     strength, late = float(found[best]), float(lags[best]) * GRID_S
-    here, slope = _matched(course, gyro, int(lags[best]))
+    here, slope = _matched(course, gyro, int(lags[best]), enough)
     agree = judged(
         names[0],
         strength,
-        (0.8, 1.0 + 1e-9),
-        (0.6, 1.0 + 1e-9),
+        (0.8, 1.0),
+        (0.6, 1.0),
         "",
         f"the course of the fixes and the z gyro turn against each other (correlation "
         f"{strength:.2f}): the gyro's sign is reversed, or z points down"
@@ -225,13 +232,13 @@ def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
 
 def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
     """Judge the level accelerometers by speed and turn: forward and left, or elsewhere."""
-    time = (log.imu.time_ns - log.imu.time_ns[0]) / 1e9
+    time = since_start(log.imu.time_ns, log)
     velocity = course_velocity(log.fixes)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    fix_time = (log.fixes.time_ns - log.imu.time_ns[0]) / 1e9 + drive.offset_s
+    fix_time = since_start(log.fixes.time_ns, log) + drive.offset_s
     inside = np.isfinite(speed) & (fix_time > time[0]) & (fix_time < time[-1])
     grid = np.arange(time[0], time[-1], SPAN_S)
-    if inside.sum() < 20 or len(grid) < 20:
+    if inside.sum() < LEAST_POINTS or len(grid) < LEAST_POINTS:
         return [Finding("forward axis", "not seen", math.nan, (0.0, 0.0), "")]
     seen = np.interp(grid, fix_time[inside], speed[inside])
     moving = (seen[1:] > 1.0) & (seen[:-1] > 1.0)
@@ -241,11 +248,9 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
         force = np.where(log.imu.valid, log.imu.accel[:, axis], 0.0)
         total = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(time))])
         gains.append(np.diff(np.interp(grid, time, total)) / SPAN_S)
-    if moving.sum() < 20 or surge[moving].std() < 0.2:
+    if moving.sum() < LEAST_POINTS or surge[moving].std() < 0.2:
         return [Finding("forward axis", "not seen", math.nan, (0.0, 0.0), "")]
-    along, across = (float(np.corrcoef(surge[moving], gain[moving])[0, 1]) for gain in gains)
-    if not math.isfinite(along):
-        along = 0.0
+    along, across = (_matched(surge[moving], gain[moving])[0] for gain in gains)
     told = (
         "points backward"
         if along < -0.3 and abs(along) > abs(across)
@@ -257,8 +262,8 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
         judged(
             "forward axis",
             along,
-            (0.3, 1.0 + 1e-9),
-            (0.0, 1.0 + 1e-9),
+            (0.3, 1.0),
+            (0.0, 1.0),
             "",
             f"when the speed grows the x accelerometer {told} (correlation {along:.2f}, y "
             f"{across:.2f}): check the axes; they must be forward, left, up",

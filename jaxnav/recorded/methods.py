@@ -23,6 +23,7 @@ from jaxnav.estimation.banks.weights import (
 )
 from jaxnav.estimation.filters.adaptive import innovation_adaptive
 from jaxnav.estimation.filters.gated import Gate, Gated, gated
+from jaxnav.estimation.filters.innovation import nis_of
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.robust import versoria
 from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
@@ -40,7 +41,6 @@ from jaxnav.estimation.types import (
 from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
-from jaxnav.numerics.linalg import cholesky, solve_lower
 from jaxnav.recorded.config import FilterConfig, members
 from jaxnav.recorded.preparation import CHANNELS, Drive
 from jaxnav.units import DEG, GRAVITY
@@ -158,19 +158,10 @@ def by_group(info: Info) -> tuple[Array, Array]:
     """Return the NIS of velocities, positions and constraints ``(3,)``, and channels of each."""
     count = info.innovation.shape[0]
     groups = (*RECEIVER, tuple(range(FIXES.stop, count)))
-    squares, used = [], []
-    for group in groups:
-        if not group:
-            squares.append(jnp.zeros(()))
-            used.append(jnp.zeros((), jnp.int32))
-            continue
-        at = np.array(group)
-        nu = info.innovation[at]
-        white = solve_lower(cholesky(info.innovation_cov[at][:, at]).factor, nu)
-        squares.append(jnp.sum(white * white))
-        # The innovation of a channel that was not used is exactly zero.
-        used.append(jnp.sum(nu != 0).astype(jnp.int32))
-    return jnp.stack(squares), jnp.stack(used)
+    squares = [nis_of(info, group) if group else jnp.zeros(()) for group in groups]
+    # The innovation of a channel that was not used is exactly zero.
+    used = [jnp.sum(info.innovation[np.array(group, int)] != 0) for group in groups]
+    return jnp.stack(squares), jnp.stack(used).astype(jnp.int32)
 
 
 def member(name: str, model: Model, channels: int) -> Filter:

@@ -9,7 +9,7 @@ from jaxnav.compiling import compiled
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.datasets.inertial import ImuLog
 from jaxnav.datasets.track import GnssTrack
-from jaxnav.navigation.earth import metres_per_radian
+from jaxnav.navigation.earth import offset_between
 from jaxnav.recorded.config import FilterConfig
 from jaxnav.units import DEG
 
@@ -52,6 +52,12 @@ def still_samples(imu: ImuLog, config: FilterConfig) -> np.ndarray:
     return still
 
 
+def runs_of(mask: np.ndarray) -> np.ndarray:
+    """Return where the runs of True in a mask ``(N,)`` begin and end, ``(R, 2)``."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return edges.reshape(-1, 2)
+
+
 def _means(values: np.ndarray, width: int) -> np.ndarray:
     """Return means ``(N - width + 1, 3)`` of so many samples on end."""
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
@@ -85,14 +91,17 @@ def course_velocity(fixes: GnssTrack) -> np.ndarray:
     after = np.clip(np.searchsorted(time, time + 0.5), None, len(time) - 1)
     span = time[after] - time[before]
     good = unknown & (span > 0) & (span < DIFFERENCED_S)
-    scale = np.asarray(_metres(jnp.asarray(fixes.geodetic[good])))
-    turn = fixes.geodetic[after[good]] - fixes.geodetic[before[good]]
-    turn[:, 1] = np.remainder(turn[:, 1] + np.pi, 2 * np.pi) - np.pi
-    velocity[good] = (scale * turn)[:, [1, 0, 2]] / span[good][:, None]
+    moved = offsets(fixes.geodetic[before[good]], fixes.geodetic[after[good]])
+    velocity[good] = moved / span[good][:, None]
     return velocity
 
 
-_metres = compiled(jax.vmap(metres_per_radian))
+def offsets(position: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return east, north, up ``(N, 3) [m]`` from geodetic positions to others near."""
+    return np.asarray(_between(jnp.asarray(position), jnp.asarray(other)))
+
+
+_between = compiled(jax.vmap(offset_between))
 
 
 def seen_moving(

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from jaxnav.compiling import compiled
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Model
-from jaxnav.navigation.earth import displaced, offset_between
+from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.vehicle import FIXES, VehicleInput, VehicleParams
 from jaxnav.recorded.methods import Kept
+from jaxnav.recorded.motion import offsets, runs_of, since_start
 from jaxnav.recorded.preparation import Drive
 from jaxnav.units import DEG
 
@@ -98,11 +99,8 @@ def diverged(kept: Kept, drive: Drive) -> bool:
     got = np.asarray(drive.observations.valid)[drive.fix_step][:, FIXES][:, 3:].all(axis=1)
     step = drive.fix_step[got]
     far = horizontal(np.asarray(kept.innovation)[step][:, 3:]) > DIVERGED_M
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(int)))
-    runs = edges.reshape(-1, 2)
-    return any(
-        drive.time[step[end - 1]] - drive.time[step[begin]] >= DIVERGED_S for begin, end in runs
-    )
+    lasted = (drive.time[step[end - 1]] - drive.time[step[begin]] for begin, end in runs_of(far))
+    return any(seconds >= DIVERGED_S for seconds in lasted)
 
 
 def mounting(kept: Kept, drive: Drive) -> np.ndarray:
@@ -138,28 +136,27 @@ def against_reference(log: DriveLog, drive: Drive, kept: Kept, offset_s: float) 
     """
     reference = log.reference
     assert reference is not None
-    time = (reference.time_ns - log.imu.time_ns[0]) / 1e9
+    time = since_start(reference.time_ns, log)
     inside = (time >= drive.time[0]) & (time <= drive.time[-1])
     later = time[inside] > drive.time[0] + REFERENCE_S
     step = np.clip(np.searchsorted(drive.time, time[inside]), 0, len(drive.time) - 1)
     mean = jax.tree.map(lambda leaf: np.asarray(leaf)[step], kept.mean)
     ahead = (time[inside] - drive.time[step])[:, None] * mean.velocity
     estimate = _displaced(jnp.asarray(mean.position), jnp.asarray(ahead))
-    offset = np.asarray(_between(jnp.asarray(reference.geodetic[inside]), estimate))
+    offset = offsets(reference.geodetic[inside], np.asarray(estimate))
     angles, constant = np.full((len(later), 3), np.nan), np.full(3, np.nan)
     if reference.dcm is not None and not later.all():
         angles, constant = _attitude_errors(reference.dcm[inside], mean.dcm, ~later)
-    fix_time = (log.fixes.time_ns - log.imu.time_ns[0]) / 1e9 + offset_s
+    fix_time = since_start(log.fixes.time_ns, log) + offset_s
     among = (fix_time > drive.time[0] + REFERENCE_S) & (fix_time <= min(time[-1], drive.time[-1]))
     true = np.stack([np.interp(fix_time[among], time, p) for p in reference.geodetic.T], axis=1)
-    receiver = np.asarray(_between(jnp.asarray(true), jnp.asarray(log.fixes.geodetic[among])))
+    receiver = offsets(true, log.fixes.geodetic[among])
     return ReferenceErrors(
         time[inside][later], offset[later], angles[later], constant, fix_time[among], receiver
     )
 
 
 _displaced = compiled(jax.vmap(displaced))
-_between = compiled(jax.vmap(offset_between))
 
 
 def _attitude_errors(

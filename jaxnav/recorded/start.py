@@ -18,7 +18,7 @@ from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.numerics.linalg import matmul
 from jaxnav.recorded.config import FilterConfig
-from jaxnav.recorded.motion import course_velocity, speed_sigma
+from jaxnav.recorded.motion import course_velocity, runs_of, speed_sigma
 from jaxnav.units import DEG
 
 DIRECTION_S = (12.0, 4.0)
@@ -107,8 +107,7 @@ def _direction(
 
 def _last_rest(still: np.ndarray, shortest: int) -> slice | None:
     """Return the last run of rest of at least so many samples."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    for begin, end in edges.reshape(-1, 2)[::-1]:
+    for begin, end in runs_of(still)[::-1]:
         if end - begin >= shortest:
             return slice(int(begin), int(end))
     return None

@@ -274,7 +274,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     "no runs": (study(runs=0), r"^runs is 0; it must be at least 1, and whole$"),
     "a run without RunOutput": (
         study(lambda key, shared: jnp.zeros(2)),
-        r"^run_one returns an array \(8, 2\) of float64; it must return RunOutput\(row\)",
+        r"^run_one returns an array \(2,\) of float64; it must return RunOutput\(row\)",
     ),
     "no steps of a fit": (
         lambda: jn.fit(lambda p: p**2, 1.0, steps=0),

@@ -51,7 +51,6 @@ def imm(filter: Filter) -> Filter:
         require_log_prior(params.log_prior, count)
 
     def init(params: BankParams) -> BankState:
-        check(params)
         return base.init(weighed(params))
 
     def predict(params: BankParams, state: BankState, u: Input) -> BankState:

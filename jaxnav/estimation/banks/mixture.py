@@ -183,7 +183,6 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
         require_log_prior(params.log_prior, count)
 
     def init(params: BankParams) -> BankState:
-        check(params)
         return narrow(single.init(widen(params)))
 
     def predict(params: BankParams, state: BankState, u: Input) -> BankState:

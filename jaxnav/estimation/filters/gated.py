@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array
 
 from jaxnav.estimation.checks import described, require_fields
+from jaxnav.estimation.filters.innovation import nis_of
 from jaxnav.estimation.types import Filter, Flag, Gaussian, Info, Input, Obs, Params
-from jaxnav.numerics.linalg import cholesky, solve_lower
 
 
 class Gate(NamedTuple):
@@ -86,7 +86,7 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
 
     def update(params: Gated, state: GatedState, u: Input, obs: Obs) -> tuple[GatedState, Info]:
         plain = filter.update(params.inner, state.inner, u, obs)
-        squares = jnp.stack([_square(plain[1], obs, group) for group in groups])
+        squares = jnp.stack([nis_of(plain[1], group) for group in groups])
         count = jnp.stack([jnp.sum(obs.valid[np.array(group)]) for group in groups])
         heard = count > 0
         dtype = squares.dtype
@@ -122,16 +122,6 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
         return state._replace(inner=filter.restart(state.inner, given))
 
     return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
-
-
-def _square(info: Info, obs: Obs, group: Sequence[int]) -> Array:
-    """Return the normalised innovation squared of a group's valid channels."""
-    at = np.array(group)
-    valid = obs.valid[at]
-    both = valid[:, None] & valid[None]
-    S = jnp.where(both, info.innovation_cov[at][:, at], jnp.eye(len(at), dtype=info.nis.dtype))
-    white = solve_lower(cholesky(S).factor, jnp.where(valid, info.innovation[at], 0))
-    return jnp.sum(white * white)
 
 
 def _tail(square: Array, count: Array) -> Array:

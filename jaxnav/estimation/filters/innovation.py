@@ -1,15 +1,18 @@
 """What every update shares: masked channels, the verdict on an innovation, checks of shapes."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from jaxnav.estimation.checks import ROUNDING
 from jaxnav.estimation.types import Flag, Info, Model, Obs, SureObs, flags_of
 from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
-from jaxnav.numerics.linalg import Cholesky, log_det, solve_lower
+from jaxnav.numerics.linalg import Cholesky, cholesky, log_det, solve_lower
 from jaxnav.numerics.roots import semidefinite_root
 
 ILL_CONDITIONED_EPS = 1e3
@@ -125,10 +128,21 @@ def mask_noise(R: Array, valid: Array) -> Array:
     return jnp.where(both, dense, jnp.eye(m, dtype=R.dtype))
 
 
+def nis_of(info: Info, channels: Sequence[int]) -> Array:
+    """Return the normalised innovation squared of some channels of an update.
+
+    One that was not used counts nothing: its innovation is zero and its row that of the identity.
+    """
+    at = np.array(channels)
+    factor = cholesky(info.innovation_cov[at][:, at]).factor
+    white = solve_lower(factor, info.innovation[at])
+    return jnp.sum(white * white)
+
+
 def is_covariance(P: Array) -> Array:
     """Return whether a matrix ``(n, n)`` is symmetric and positive semi-definite, to rounding."""
     sigma = jnp.sqrt(jnp.maximum(jnp.diag(P), 0))
-    rounding = 1e3 * jnp.finfo(P.dtype).eps * sigma[:, None] * sigma[None]
+    rounding = max(ROUNDING, 1e3 * float(jnp.finfo(P.dtype).eps)) * sigma[:, None] * sigma[None]
     symmetric = jnp.all(jnp.abs(P - P.T) <= rounding)
     return symmetric & semidefinite_root(P).semidefinite
 

@@ -103,7 +103,7 @@ def fit(
         ValueError: If a starting value is outside its domain, or ``steps`` below 1.
         StartError: A ``ValueError``, if the loss there is not finite.
     """
-    if not isinstance(steps, int) or steps < 1:
+    if not isinstance(steps, int | np.integer) or steps < 1:
         raise ValueError(f"steps is {steps}; a fit needs a whole number of at least 1")
     free = coordinates(start, transform)
     given = (lambda number: data) if batches is None else (lambda number: (batches(number),))

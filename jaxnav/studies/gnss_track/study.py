@@ -250,6 +250,8 @@ def _notes(config: GnssTrackConfig, track: GnssTrack, data: TrackData) -> list[s
         f"{steps.size} steps of {np.median(steps):g} s after the first fix of {track.source}; "
         f"standard errors from {BLOCKS} blocks of the track."
     ]
+    if track.unsolved:
+        notes.append(f"{track.unsolved} fixes without a solution were left out.")
     if track.duplicates:
         notes.append(f"{track.duplicates} fixes with a repeated time stamp were left out.")
     missing = gaps(thin(track, config.thin_period_s) if config.scenario == "thinned" else track)
