@@ -62,7 +62,7 @@ class FilterConfig:
         stop_accel: Standard deviation of the specific force that it stays below [m/s^2].
         stop_time_s: For so long; both of means over 0.2 s.
         gate: Whether fixes that contradict the filter are refused, and named.
-        gate_probability: With which a position or a velocity passes if the filter is right.
+        gate_false_alarm: Probability to refuse a position or a velocity though the filter is right.
         gate_patience: Refusals in a row over which the gate opens by e, in squares.
         strict: Whether a fault that the audit finds makes the exit code 4.
         align_speed: Speed at which the course gives the heading, and the filter starts [m/s].
@@ -107,7 +107,7 @@ class FilterConfig:
     stop_accel: float = 0.06
     stop_time_s: float = 2.0
     gate: bool = True
-    gate_probability: float = 1 - 1e-9
+    gate_false_alarm: float = 1e-9
     gate_patience: float = 5.0
     strict: bool = False
     align_speed: float = 3.0
@@ -142,7 +142,7 @@ def check(config: FilterConfig) -> None:
         *("r_factors", "q_factors", "forgetting", "rule_time_s"),
         *("gyro_noise_dps", "accel_noise_ug", "gyro_walk_dps", "accel_walk_ug"),
         *("position_sigma_m", "velocity_sigma", "steered_sigma", "steered_rate_hz", "rest_sigma"),
-        *("rest_speed", "gate_probability", "gate_patience"),
+        *("rest_speed", "gate_false_alarm", "gate_patience"),
         *("stop_gyro_dps", "stop_accel", "stop_time_s", "align_speed", "outage_s"),
         *("noise_sigma_m", "noise_rate_hz"),
     )
@@ -155,7 +155,7 @@ def check(config: FilterConfig) -> None:
         f"one factor for {config.filter}; several make a bank of sage-husa-ekf",
     )
     accepted = "above 0 and below 1"
-    require(config.gate_probability < 1, "gate_probability", config.gate_probability, accepted)
+    require(config.gate_false_alarm < 1, "gate_false_alarm", config.gate_false_alarm, accepted)
     count = members(config)
     accepted = f"positive and below the equal weight of the {count} members"
     require(0 < config.weight_floor < 1 / count, "weight_floor", config.weight_floor, accepted)

@@ -248,7 +248,7 @@ def filter_params(
     inner = _ungated(config, drive, lever_arm, form, mounting)
     if not config.gate:
         return inner
-    gate = Gate(jnp.array(config.gate_probability), jnp.array(config.gate_patience))
+    gate = Gate(jnp.array(config.gate_false_alarm), jnp.array(config.gate_patience))
     return Gated(inner, gate)
 
 

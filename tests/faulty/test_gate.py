@@ -101,12 +101,12 @@ def test_what_goes_on_contradicting_is_let_in(name: str) -> None:
         assert np.max(np.abs(mean - TRUTH - [jump, 0, 0, 0])[late, :2]) < 5 * SIGMA[0]
 
 
-def test_patience_and_probability_are_parameters() -> None:
+def test_patience_and_false_alarm_are_parameters() -> None:
     z = Z.copy()
     z[150:, 0] += 10.0
     _, never = ran("kf", z, Gate(patience=jnp.inf))
     assert np.all(never[150:] & Flag.REFUSED)
-    _, strict = ran("kf", Z, Gate(probability=0.9))
+    _, strict = ran("kf", Z, Gate(false_alarm=0.1))
     share = np.mean((strict & Flag.REFUSED) > 0)
     assert 0.1 < share < 0.3
 
@@ -125,3 +125,18 @@ def test_groups_are_apart_and_parameters_are_its_own() -> None:
     obs = jn.Obs(jnp.asarray(Z), jnp.ones(Z.shape, bool))
     with pytest.raises(ValueError, match=r"^params is a FilterParams; a gated filter takes Gated"):
         jn.run(GATES["kf"], PRIOR, jnp.zeros((STEPS, 1)), obs)
+
+
+def test_the_gate_holds_in_32_bits() -> None:
+    narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), PRIOR)
+    z = jnp.asarray(Z, jnp.float32).at[50, 0].add(1.1e3)
+    obs = jn.Obs(z, jnp.ones(z.shape, bool))
+    params = Gated(narrow, Gate(jnp.float32(1e-9), jnp.float32(5.0)))
+    model = MODEL._replace(
+        transition=lambda p, x, u: jnp.asarray(F, jnp.float32) @ x,
+        process_noise=lambda p, x, u: jnp.asarray(Q, jnp.float32),
+        observation_noise=lambda p, x, u: p * jnp.asarray(SIGMA**2, jnp.float32),
+    )
+    inputs = jnp.zeros((STEPS, 1), jnp.float32)
+    flags = jn.run(gated(jn.kf(model), GROUPS), params, inputs, obs).record[1].flags
+    np.testing.assert_array_equal(np.flatnonzero(flags & Flag.REFUSED), [50])

@@ -17,12 +17,13 @@ class Gate(NamedTuple):
     """Parameters of a gate.
 
     Attributes:
-        probability: With which a group of channels passes if the filter is right, in (0, 1).
+        false_alarm: Probability with which a group of channels is refused though the filter is
+            right, in (0, 1); its complement would round to one in 32-bit floats.
         patience: Refusals in a row over which the gate opens by ``e`` in the square of an
             innovation, above zero; infinite, it never opens.
     """
 
-    probability: Array | float = 1 - 1e-7
+    false_alarm: Array | float = 1e-7
     patience: Array | float = 5.0
 
 
@@ -72,7 +73,7 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
         if not isinstance(params, Gated):
             raise ValueError(f"params is {described(params)}; a gated filter takes Gated(inner)")
         domains = {
-            "probability": ("(0, 1)", 0.0, 1.0),
+            "false_alarm": ("(0, 1)", 0.0, 1.0),
             "patience": ("(0, inf]", 0.0, jnp.inf),
         }
         require_fields("gate", params.gate, Gate, domains)
@@ -91,8 +92,8 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
         heard = count > 0
         dtype = squares.dtype
         opened = jnp.exp(-state.refused.astype(dtype) / params.gate.patience)
-        improbable = _tail(squares, count) < 1 - params.gate.probability
-        refuse = heard & (_tail(squares * opened, count) < 1 - params.gate.probability)
+        improbable = _tail(squares, count) < params.gate.false_alarm
+        refuse = heard & (_tail(squares * opened, count) < params.gate.false_alarm)
         reopened = heard & improbable & ~refuse
         channels = jnp.zeros(obs.valid.shape, bool)
         for i, group in enumerate(groups):
