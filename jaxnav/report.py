@@ -169,7 +169,8 @@ def print_allan(document: dict[str, Any], directory: Path) -> None:
     console.print(
         f"{document['samples']} samples, {document['samples'] * step:.6g} s at {1 / step:.6g} Hz; "
         f"{counts['duplicates']} duplicates dropped, {counts['nan_rows']} rows with an entry that "
-        f"is no number, {counts['gaps']} gaps of {counts['missing']} samples",
+        f"is no number, {counts['gaps']} gaps of {counts['missing']} samples"
+        + (f", {counts['spikes']} spikes left out" if counts["spikes"] else ""),
         soft_wrap=True,
     )
     for sensor, title in (("gyro", "gyros"), ("accel", "accelerometers")):
@@ -194,6 +195,8 @@ def _noise_table(
 
 def _coefficient(entry: dict[str, Any]) -> str:
     """Return a coefficient over its interval, or its bound where it may be zero."""
+    if entry["value"] is None:
+        return "not known"
     if entry["low"] > 0:
         return f"{entry['value']:.4g}\n{entry['low']:.3g} to {entry['high']:.3g}"
     return f"below {entry['high']:.3g}" if entry["high"] < float("inf") else "not known"

@@ -14,6 +14,7 @@ from jaxnav import compiling
 from jaxnav.cli import configure_jax
 from jaxnav.datasets.base import DataError
 
+OPTIMISED = dict(compiling.OPTIONS)
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 jax.config.update("jax_enable_x64", True)
@@ -31,23 +32,21 @@ def pytest_configure(config: pytest.Config) -> None:
     configure_jax()
 
 
-@pytest.fixture
-def quick_programs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the optimiser out: a third of the time to compile, three times that to run."""
-    monkeypatch.setattr(compiling, "OPTIONS", compiling.OPTIONS | QUICK)
+@pytest.fixture(autouse=True, scope="session")
+def default_options() -> Iterator[None]:
+    """Leave the optimiser out: a third of the time to compile, three times that to run.
+
+    For the whole session, since what a module shares is made before any fixture of a test.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiling, "OPTIONS", OPTIMISED | QUICK)
+        yield
 
 
 @pytest.fixture
-def optimised_programs() -> None:
-    """Asked for by tests of what rounding does, which the optimiser has a part in."""
-
-
-@pytest.fixture(autouse=True)
-def all_but_slow_tests_compile_quickly(request: pytest.FixtureRequest) -> None:
-    """Slow tests that compile more than they run ask for it themselves."""
-    slow = request.node.get_closest_marker("slow") is not None
-    if not slow and "optimised_programs" not in request.fixturenames:
-        request.getfixturevalue("quick_programs")
+def optimised_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asked for by tests of what rounding does, and by those that run more than they compile."""
+    monkeypatch.setattr(compiling, "OPTIONS", OPTIMISED)
 
 
 @pytest.fixture(autouse=True, scope="module")

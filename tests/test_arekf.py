@@ -5,14 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxnav.estimation.metrics import chi2_mean_bounds
-from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.studies.arekf.analysis import GRADES, ratio_map
-from jaxnav.studies.arekf.claims import assess, change
+from jaxnav.studies.arekf.claims import change
 from jaxnav.studies.arekf.config import ArekfConfig
 from jaxnav.studies.arekf.figures import draw
-from jaxnav.studies.arekf.methods import AXES, KINDS, METHODS
-from jaxnav.studies.arekf.study import epochs_of, run_campaign, run_study
+from jaxnav.studies.arekf.methods import AXES, KINDS
+from jaxnav.studies.arekf.study import run_campaign, run_study
 from jaxnav.studies.base import ConfigError
 
 
@@ -55,87 +53,15 @@ def test_the_map_is_of_the_noise_and_not_of_the_bias() -> None:
     assert found.ratio[biased].max() < 1.1
 
 
-FACTORS = (1.0, 3.0, 10.0, 20.0)
-RUNS = 64
-"""Flights at full length, enough of them for every interval that is asserted here; the command line
-runs 150."""
-
-
-@pytest.fixture(scope="module")
-def drift() -> dict[float, Campaign]:
-    return {factor: run_campaign(ArekfConfig(runs=RUNS), factor) for factor in FACTORS}
-
-
 @pytest.mark.slow
-def test_identified_noise_is_as_good_as_the_true_one(drift: dict[float, Campaign]) -> None:
-    for campaign in drift.values():
-        assert campaign.finite.all()
-        for kind in KINDS:
-            found = change(campaign, "arekf", "oracle", kind)
-            assert max(abs(found.low), abs(found.high)) < 0.03
-
-
-@pytest.mark.slow
-def test_noise_ten_times_too_small_costs_attitude_and_velocity(
-    drift: dict[float, Campaign],
-) -> None:
-    for kind in KINDS[:2]:
-        assert change(drift[10.0], "ekf", "arekf", kind).value > 0.8
-    assert abs(change(drift[10.0], "ekf", "arekf", "position").value) < 0.05
-    config = ArekfConfig(factors=FACTORS)
-    claims = {claim.id: claim for claim in assess(config, drift, None)}
-    for rival in ("liekf", "se23-ekf", "versoria-ekf"):
-        assert claims[f"{rival}-beats-ekf"].verdict == "not testable"
-    assert change(drift[10.0], "mmae", "oracle", "attitude").high < 0.03
-    assert change(drift[10.0], "versoria-ekf", "ekf", "velocity").low > 0
-
-
-@pytest.mark.slow
-def test_what_the_monte_carlo_finds_is_what_covariance_foretells(
-    drift: dict[float, Campaign],
-) -> None:
-    expected = ratio_map(ArekfConfig(factors=FACTORS)).ratio[0, :, -1]
-    for i, factor in enumerate(FACTORS[1:], start=1):
-        for j, kind in enumerate(KINDS):
-            found = change(drift[factor], "ekf", "arekf", kind)
-            # the interval is of 95 %; twice its width holds nine of nine but for one in a thousand
-            half = found.high - found.low
-            assert abs(found.value + 1 - expected[i, j]) < max(half, 0.02)
-
-
-@pytest.mark.slow
-def test_arekf_is_consistent_and_the_ekf_is_not(drift: dict[float, Campaign]) -> None:
-    """All fifteen states at twelve times, initial errors drawn from P0."""
-    low, high = chi2_mean_bounds(15, RUNS)
-    for factor, campaign in drift.items():
-        nees = campaign.mean_curve["nees"]
-        nees = nees[epochs_of(len(nees))]
-        for name in ("arekf", "oracle"):
-            own = nees[:, METHODS.index(name)]
-            assert np.all((low < own) & (own < high))
-        ekf = nees[:, METHODS.index("ekf")]
-        assert np.all(ekf > high) if factor >= 3 else np.all((low < ekf) & (ekf < high))
-
-
-@pytest.mark.slow
-def test_where_bias_limits_the_filter_its_noise_hardly_matters() -> None:
-    campaign = run_campaign(ArekfConfig(scenario="bias-dominated", runs=RUNS), 20.0)
+def test_noise_believed_ten_times_too_small_is_found_again() -> None:
+    """A sample of ``checks/full_size``: the first half minute of four flights."""
+    config = ArekfConfig(runs=4, duration_s=30.0, settle_s=10.0)
+    campaign = run_campaign(config, 10.0)
+    assert campaign.finite.all()
     for kind in KINDS:
-        assert change(campaign, "ekf", "arekf", kind).high < 0.1
-
-
-@pytest.mark.slow
-def test_versoria_pays_with_outliers_and_invariance_with_a_lost_heading() -> None:
-    spoiled = run_campaign(ArekfConfig(scenario="outliers", runs=RUNS), 1.0)
-    for kind in KINDS:
-        assert change(spoiled, "versoria-ekf", "ekf", kind).high < -0.1
-    lost = run_campaign(ArekfConfig(scenario="large-heading-error", runs=RUNS), 1.0)
-    low, high = chi2_mean_bounds(15, RUNS)
-    for name in ("liekf", "se23-ekf"):
-        for kind in KINDS:
-            assert change(lost, name, "ekf", kind).high < -0.2
-        assert low < lost.rows.final_nees[:, METHODS.index(name)].mean() < high
-    assert lost.rows.final_nees[:, METHODS.index("ekf")].mean() > high
+        assert abs(change(campaign, "arekf", "oracle", kind).value) < 0.1
+    assert change(campaign, "ekf", "arekf", "velocity").value > 0.2
 
 
 @pytest.mark.slow

@@ -39,8 +39,6 @@ from jaxnav.numerics.sigma import SigmaRule, unscented
 from tests.cases import Noise, cases
 from tests.oracles.matrices import central_difference
 
-pytestmark = pytest.mark.usefixtures("quick_programs")
-
 
 def oscillator(observe: Callable[[Array], Array]) -> Model:
     """A damped oscillator of two states that is pushed; its noise is of rank one."""

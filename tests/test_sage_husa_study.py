@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 
 from jaxnav.estimation.banks.mixture import moment_match
-from jaxnav.estimation.metrics import chi2_mean_bounds
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.estimation.types import Gaussian
 from jaxnav.navigation.earth import displaced, offset_between
 from jaxnav.navigation.models.level_errors import SinsLevel, error_form
 from jaxnav.studies.base import ConfigError
 from jaxnav.studies.sage_husa import study
-from jaxnav.studies.sage_husa.claims import NOISY, assess, best_single, change, right_weight
+from jaxnav.studies.sage_husa.claims import NOISY, assess, change
 from jaxnav.studies.sage_husa.config import SageHusaConfig
 from jaxnav.studies.sage_husa.figures import draw
-from jaxnav.studies.sage_husa.methods import BANKS, HORIZONTAL, horizontal, methods_of
+from jaxnav.studies.sage_husa.methods import BANKS, HORIZONTAL, horizontal
 from jaxnav.studies.sage_husa.study import compared, run_campaign
 from tests.oracles.matrices import random_spd
 
@@ -70,7 +69,8 @@ def test_horizontal_positions_of_mixtures_are_those_of_the_bank() -> None:
         np.testing.assert_allclose(found.cov[i], bank.cov[HORIZONTAL, HORIZONTAL], rtol=1e-5)
 
 
-RUNS = 12
+RUNS = 3
+"""At full length, which the intervals of the claims need; ``checks/full_size`` has more of them."""
 
 
 def config_of(scenario: str) -> SageHusaConfig:
@@ -82,52 +82,13 @@ def tuned() -> Campaign:
     return run_campaign(config_of("tuned"))
 
 
-@pytest.fixture(scope="module")
-def mistuned() -> Campaign:
-    return run_campaign(config_of("mistuned"))
-
-
 @pytest.mark.slow
-def test_tuned_adapting_r_pays_while_the_fixes_are_noisy(tuned: Campaign) -> None:
-    config = config_of("tuned")
-    for interval in NOISY:
-        assert change(config, tuned, "mmae", "ukf", interval).high < 0
-        assert change(config, tuned, "sage-husa", "ukf", interval).high < 0
-        assert change(config, tuned, "oracle", "mmae", interval).high < 0
-        rival = best_single(config, tuned, interval)
-        assert change(config, tuned, "proposed", rival, interval).low > 0, "nothing to repair"
-        assert change(config, tuned, "proposed-bayes-floor", "proposed", interval).high < 0
-        harm = change(config, tuned, "unnormalised-floor", "proposed-bayes-floor", interval)
-        assert harm.low > 0, "the normaliser differs from model to model"
-
-
-@pytest.mark.slow
-def test_mistuned_the_bank_repairs_q(mistuned: Campaign) -> None:
-    """By a tenth where the fixes are good; by less than so few runs can show where they are not."""
-    config = config_of("mistuned")
-    for bank in ("proposed", "proposed-bayes-floor"):
-        rival = best_single(config, mistuned, 1)
-        assert change(config, mistuned, bank, rival, 1).high < -0.03
-        for interval in NOISY:
-            assert change(config, mistuned, bank, rival, interval).low < 0
-            assert change(config, mistuned, bank, "mmae", interval).high < 0
-    share = right_weight(config, mistuned.mean_curve["weights"])[-1]
-    assert share[list(BANKS).index("proposed")] > 0.9
-    assert share[list(BANKS).index("proposed-bayes-floor")] > 0.9
-
-
-@pytest.mark.slow
-def test_oracle_is_consistent_and_the_fixed_filter_is_not(tuned: Campaign) -> None:
-    """Means over an interval of correlated errors scatter more than of as many independent runs."""
-    config = config_of("tuned")
-    nees = tuned.rows.nees.mean(axis=0)
-    names = methods_of(config)
-    low, high = chi2_mean_bounds(2, RUNS)
-    assert np.all(low < nees[names.index("oracle"), :3])
-    assert np.all(nees[names.index("oracle"), :3] < high)
-    assert np.all(nees[names.index("ukf")][list(NOISY)] > high)
+def test_adapting_r_pays_while_the_fixes_are_noisy(tuned: Campaign) -> None:
+    """A sample of ``checks/full_size``, without its intervals."""
     assert tuned.finite.all()
-    assert np.all(tuned.rows.final_square < 100.0**2)
+    for interval in NOISY:
+        for name in ("mmae", "sage-husa", "oracle"):
+            assert change(config_of("tuned"), tuned, name, "ukf", interval).value < -0.1
 
 
 @pytest.mark.slow

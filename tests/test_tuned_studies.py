@@ -36,8 +36,6 @@ recorded = pytest.mark.skipif(
     not DRIVE.is_file(), reason="the recorded drive is not in ../shared/data"
 )
 
-pytestmark = pytest.mark.usefixtures("quick_programs")
-
 
 def transforms_of(problem: Problem) -> dict[str, Transform]:
     return {name: own.transform for name, own in problem.parameters.items()}

@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.plausible import check_plausible
+from jaxnav.datasets.stamps import steps_between
 from jaxnav.datasets.table import FORCE, RATE, Units, read_table
 
 SENSORS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 COLUMNS = ("time", *SENSORS)
 SENSOR_UNITS: Units = {name: RATE if name.startswith("gyro") else FORCE for name in SENSORS}
-GAP = 1.5
-"""Intervals above so many median intervals are gaps."""
 REPEATED = 0.05
 """Share of samples that may repeat a time: a logger that wrote some of them twice."""
 MANY = 100
@@ -43,11 +42,10 @@ class ImuLog(NamedTuple):
         gyro: Angular rate ``(N, 3) [rad/s]``; zero where not valid.
         accel: Specific force ``(N, 3) [m/s^2]``; zero where not valid.
         valid: Whether all six entries of a sample are known, ``(N,)``.
-        step_s: Sampling interval [s], the mean of the intervals that are no gaps: time stamps in
-            whole milliseconds have a median interval that is wrong by percents.
+        step_s: Sampling interval [s] (:func:`~jaxnav.datasets.stamps.steps_between`).
         duplicates: Rows dropped because they repeat the time before.
         nan_rows: Rows with an entry that is empty, not a number, infinite or cut off.
-        gaps: Intervals above one and a half median intervals.
+        gaps: Intervals in which samples are missing.
         missing: Samples that those intervals lack.
         source: Path of the file.
     """
@@ -158,10 +156,17 @@ def on_grid(log: ImuLog) -> ImuLog:
         The log with ``N + missing`` samples; the counts stay.
 
     Raises:
-        DataError: If the gaps hold more than a hundred times the samples of the log.
+        DataError: If the gaps hold more than a hundred times the samples of the log, or are not
+            told from jitter.
     """
     intervals = np.diff(log.time_ns)
-    steps = _steps(intervals)
+    steps, _, told = steps_between(intervals)
+    if not told:
+        raise DataError(
+            f"{log.source}: many samples are missing and the stamps of the others scatter by a "
+            "large part of the sampling interval, so gaps are not told from jitter; accepted are "
+            "even stamps or complete samples"
+        )
     count = 1 + int(steps.sum())
     if count > SPARSEST * len(log.time_ns):
         raise DataError(
@@ -182,23 +187,16 @@ def _counted(
     duplicates: int,
     source: str,
 ) -> ImuLog:
-    intervals = np.diff(time_ns)
-    steps = _steps(intervals)
+    steps, step, _ = steps_between(np.diff(time_ns))
     return ImuLog(
         time_ns=time_ns,
         gyro=values[:, :3],
         accel=values[:, 3:],
         valid=valid,
-        step_s=float(np.mean(intervals[steps == 1])) / 1e9,
+        step_s=step / 1e9,
         duplicates=duplicates,
         nan_rows=int(np.sum(~valid)),
         gaps=int(np.sum(steps > 1)),
         missing=int(np.sum(steps - 1)),
         source=source,
     )
-
-
-def _steps(intervals: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many steps each interval is; up to one and a half it is one."""
-    ratio = intervals / np.median(intervals)
-    return np.maximum(1, np.ceil(ratio - (GAP - 1))).astype(np.int64)

@@ -15,12 +15,15 @@ class AllanConfig:
         end_s: End of that part; by default that of the log.
         confidence: Probability of the intervals.
         per_octave: Cluster times in an octave.
+        accept_doubts: Analyse what looks like a wrong unit, swapped columns or a sensor that moves,
+            and tell the doubts as notes.
     """
 
     start_s: float = 0.0
     end_s: float | None = None
     confidence: float = 0.95
     per_octave: int = 1
+    accept_doubts: bool = False
 
 
 def check(config: AllanConfig) -> None:

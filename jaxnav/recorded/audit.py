@@ -13,9 +13,10 @@ import numpy as np
 
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Flag
+from jaxnav.numerics.masks import runs_of
 from jaxnav.recorded.findings import Finding, judged
 from jaxnav.recorded.methods import Kept
-from jaxnav.recorded.motion import course_velocity, runs_of, since_start
+from jaxnav.recorded.motion import course_velocity, since_start
 from jaxnav.recorded.preparation import Drive
 from jaxnav.units import DEG
 

@@ -52,12 +52,6 @@ def still_samples(imu: ImuLog, config: FilterConfig) -> np.ndarray:
     return still
 
 
-def runs_of(mask: np.ndarray) -> np.ndarray:
-    """Return where the runs of True in a mask ``(N,)`` begin and end, ``(R, 2)``."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return edges.reshape(-1, 2)
-
-
 def _means(values: np.ndarray, width: int) -> np.ndarray:
     """Return means ``(N - width + 1, 3)`` of so many samples on end."""
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])

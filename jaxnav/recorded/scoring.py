@@ -14,8 +14,9 @@ from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.vehicle import FIXES, VehicleInput, VehicleParams
+from jaxnav.numerics.masks import runs_of
 from jaxnav.recorded.methods import Kept
-from jaxnav.recorded.motion import offsets, runs_of, since_start
+from jaxnav.recorded.motion import offsets, since_start
 from jaxnav.recorded.preparation import Drive
 from jaxnav.units import DEG
 

@@ -17,8 +17,9 @@ from jaxnav.navigation.alignment import align_with_heading, course_heading
 from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.numerics.linalg import matmul
+from jaxnav.numerics.masks import runs_of
 from jaxnav.recorded.config import FilterConfig
-from jaxnav.recorded.motion import course_velocity, runs_of, speed_sigma
+from jaxnav.recorded.motion import course_velocity, speed_sigma
 from jaxnav.units import DEG
 
 DIRECTION_S = (12.0, 4.0)

@@ -5,6 +5,7 @@ interval; its integral, the phase, is an angle or a velocity. ``u`` stands for r
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,10 @@ from jaxnav.numerics.linalg import safe_sqrt
 
 FLICKER = 2 * math.log(2) / math.pi
 """Allan variance of flicker noise of density ``1 / (2 pi f)``, at any cluster time."""
+CHI2_MEDIAN = 0.454936423119572
+"""Median of a chi-square variable of one degree of freedom."""
+MEDIAN_TERMS = 100_000
+"""Second differences of a size that a median is taken of, more or less."""
 
 
 class AllanVariance(NamedTuple):
@@ -99,23 +104,14 @@ def allan_variance(
     References:
         Allan (1966), Proc. IEEE 54(2); Riley (2008), NIST SP 1065, Sec. 5.2.
     """
-    count = rate.shape[0]
-    for size in sizes:
-        if not 1 <= size <= count // 2:
-            raise ValueError(f"sizes must be from 1 to {count // 2}, got {size}")
-    phase = _phase(rate, valid)
-    lost = None if valid is None else jnp.pad(jnp.cumsum(~valid), (1, 0))
     sums, terms, whole = [], [], []
-    for m in sizes:
-        stride = 1 if overlapping else m
-        begin, middle, end = (slice(j * m, count + 1 - (2 - j) * m, stride) for j in range(3))
-        change = (phase[end] - phase[middle] - (phase[middle] - phase[begin])) / m
+    strides = [1 if overlapping else m for m in sizes]
+    for change, use in _changes(rate, sizes, valid, strides):
         whole.append(change.shape[0])
-        if lost is None:
+        if use is None:
             sums.append(jnp.sum(change**2))
             terms.append(jnp.asarray(change.shape[0]))
         else:
-            use = lost[end] == lost[begin]
             sums.append(jnp.sum(jnp.where(use, change**2, 0)))
             terms.append(jnp.sum(use))
     used = jnp.stack(terms).astype(rate.dtype)
@@ -125,6 +121,59 @@ def allan_variance(
         terms=used,
         share=used / jnp.asarray(whole, rate.dtype),
     )
+
+
+def median_variance(
+    rate: Array, step: float, sizes: tuple[int, ...], valid: Array | None = None
+) -> AllanVariance:
+    """Return the Allan variance by the median of the squared changes, which a few do not move.
+
+    As :func:`allan_variance`, of every k up to a hundred thousand of them, with the mean replaced
+    by the median over that of a chi-square variable of one degree. For noises that are normal both
+    estimate the same; this one scatters by two thirds more.
+
+    Args:
+        rate: Samples ``(N,) [u/s]``.
+        step: Sampling interval ``T`` [s].
+        sizes: Cluster sizes m in samples, static, at most ``N / 2``.
+        valid: Which samples are known ``(N,)``; by default all.
+
+    Returns:
+        The variance at each size.
+
+    Raises:
+        ValueError: If a size is not from 1 to ``N / 2``.
+    """
+    variances, terms, whole = [], [], []
+    for change, use in _changes(rate, sizes, valid, strides=[_thin(len(rate), m) for m in sizes]):
+        square = change**2 if use is None else jnp.where(use, change**2, jnp.nan)
+        middle = jnp.nanmedian(square)
+        variances.append(jnp.where(jnp.isnan(middle), 0, middle) / (2 * CHI2_MEDIAN))
+        whole.append(change.shape[0])
+        terms.append(jnp.asarray(change.shape[0]) if use is None else jnp.sum(use))
+    used = jnp.stack(terms).astype(rate.dtype)
+    tau = step * jnp.asarray(sizes, rate.dtype)
+    return AllanVariance(tau, jnp.stack(variances), used, used / jnp.asarray(whole, rate.dtype))
+
+
+def _thin(count: int, size: int) -> int:
+    return max(1, (count + 1 - 2 * size) // MEDIAN_TERMS)
+
+
+def _changes(
+    rate: Array, sizes: tuple[int, ...], valid: Array | None, strides: list[int]
+) -> Iterator[tuple[Array, Array | None]]:
+    """Yield, for each size, the second differences of the phase over m, and which are whole."""
+    count = rate.shape[0]
+    for size in sizes:
+        if not 1 <= size <= count // 2:
+            raise ValueError(f"sizes must be from 1 to {count // 2}, got {size}")
+    phase = _phase(rate, valid)
+    lost = None if valid is None else jnp.pad(jnp.cumsum(~valid), (1, 0))
+    for m, stride in zip(sizes, strides, strict=True):
+        begin, middle, end = (slice(j * m, count + 1 - (2 - j) * m, stride) for j in range(3))
+        change = (phase[end] - phase[middle] - (phase[middle] - phase[begin])) / m
+        yield change, None if lost is None else lost[end] == lost[begin]
 
 
 def _phase(rate: Array, valid: Array | None) -> Array:
