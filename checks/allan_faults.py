@@ -47,7 +47,7 @@ def main() -> int:
         if ratios:
             value, low, high = np.moveaxis(np.array(ratios), 2, 0)
             known = np.isfinite(value)
-            inside = (low <= 1) & (1 <= high)
+            inside = (low <= 1) & (high >= 1)
             entry["inside"] = round(float(inside[known].mean()), 4)
             entry["scatter"] = round(float(np.std(value[known])), 4)
             entry["mean"] = round(float(np.mean(value[known])), 4)

@@ -22,6 +22,7 @@ from jaxnav.navigation.sensors.noise_fit import (
 
 # As programs: a kernel for every operation and shape takes longer to compile.
 allan_variance = compiled(allan.allan_variance, static_argnames=("step", "sizes", "overlapping"))
+median_variance = compiled(allan.median_variance, static_argnames=("step", "sizes"))
 slope_rule = compiled(allan.slope_rule, static_argnames="sharpness")
 degrees_of_freedom = compiled(
     noise_fit.degrees_of_freedom, static_argnames=("step", "sizes", "count")
@@ -390,3 +391,21 @@ def test_noises_follow_their_laws(key):
         assert np.all(np.abs(ratio.mean(axis=(0, 1)) - 1) < 5 * error + slack)
     with pytest.raises(ValueError, match="count"):
         sensor_noise(key, noise_model(N=1.0), step, 0)
+
+
+def test_the_median_is_as_good_without_spikes_and_better_with(key):
+    """Of white noise within five standard errors; a spike moves the mean alone."""
+    sizes = (1, 4, 16, 64)
+    rate = sensor_noise(key, NoiseModel(0.0, jnp.full(1, 0.1), 0.0, 0.0), 0.01, 20_000)[:, 0]
+    valid = jnp.ones(20_000, bool).at[500:600].set(False)
+    spoilt = rate.at[7_000].add(100.0)
+    expected = 0.1 / np.sqrt(0.01 * np.array(sizes))
+    scatter = 1.17 * np.sqrt(np.array(sizes) / 20_000)
+    for one in (rate, spoilt):
+        for mask in (None, valid):
+            found = median_variance(one, 0.01, sizes, mask)
+            assert np.all(np.abs(found.deviation / expected - 1) < 5 * scatter)
+    usual = allan_variance(spoilt, 0.01, sizes)
+    assert usual.deviation[0] > 1.3 * expected[0]
+    with pytest.raises(ValueError, match="sizes must be from 1 to 10000"):
+        median_variance(rate, 0.01, (10_001,))

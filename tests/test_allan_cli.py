@@ -60,7 +60,8 @@ def test_coefficients_are_printed_and_written(
         assert word in said
     document = json.loads((tmp_path / "summary.json").read_text())
     assert (document["schema"], document["command"]) == (1, "allan")
-    assert document["counts"] == {"duplicates": 1, "nan_rows": 1, "gaps": 1, "missing": 100}
+    counts = {"duplicates": 1, "nan_rows": 1, "gaps": 1, "missing": 100, "spikes": 0}
+    assert document["counts"] == counts
     assert document["samples"] == COUNT
     assert document["provenance"]["x64"] is True
     assert document["notes"] == []
@@ -113,12 +114,18 @@ def test_a_sensor_that_moves_or_is_stuck_is_named(
     path = tmp_path / "moving.csv"
     everything = np.column_stack([time, table])
     np.savetxt(path, everything, delimiter=",", header=HEADER, comments="", fmt="%.12g")
-    assert main(["allan", str(path), "--out", str(tmp_path / "out")]) == OK
+    assert main(["allan", str(path), "--out", str(tmp_path / "out")]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert "gyro_y moves by 114 deg/s beyond its noise" in said
+    assert "--accept-doubts" in said
+    assert not (tmp_path / "out").exists()
+    arguments = ["allan", str(path), "--accept-doubts", "--out", str(tmp_path / "out")]
+    assert main(arguments) == OK
     said = capsys.readouterr().out
     assert "gyro_y: the four noises do not explain" in said
     assert "accel_x: constant" in said
     notes = json.loads((tmp_path / "out" / "summary.json").read_text())["notes"]
-    assert len(notes) == 2
+    assert len(notes) == 3
 
 
 BAD = {

@@ -1,4 +1,4 @@
-"""Logs of a sensor at rest with a fault: the right coefficient, or a refusal that names the cause."""
+"""Logs of a sensor at rest with a fault: right within its interval, or refused with the cause."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from jaxnav.datasets.base import DataError
 from jaxnav.noise_report.analysis import analyse, prepare
 from jaxnav.noise_report.config import AllanConfig
 from jaxnav.units import DEG_PER_SQRT_HOUR, HOUR
-from tests.faulty.rest import FAULTS, RATE_HZ, WALK, clean, log_of
+from tests.faulty.rest import FAULTS, WALK, clean, log_of
 
 COUNT = 60_000
 SEED = 11
