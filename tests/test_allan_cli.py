@@ -125,7 +125,7 @@ def test_a_sensor_that_moves_or_is_stuck_is_named(
     assert "gyro_y: the four noises do not explain" in said
     assert "accel_x: constant" in said
     notes = json.loads((tmp_path / "out" / "summary.json").read_text())["notes"]
-    assert len(notes) == 3
+    assert len(notes) == 4
 
 
 BAD = {
