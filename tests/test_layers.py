@@ -24,6 +24,7 @@ ORDER = (
     "numerics.sequences",
     "estimation.types",
     "estimation.checks",
+    "estimation.debugging",
     "estimation.filters.innovation",
     "estimation.filters.linearise",
     "estimation.filters.given_noise",

@@ -1,14 +1,17 @@
 """Runs over time: the only ``lax.scan`` over filter time."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.experimental import checkify
 
 from jaxnav.compiling import compiled
 from jaxnav.estimation.checks import require_filter, require_observations
+from jaxnav.estimation.debugging import check_covariance, checking
 from jaxnav.estimation.types import Filter, Input, Model, Obs, Params
 from jaxnav.numerics.conditioning import KEPT
 
@@ -31,6 +34,7 @@ def run(
     record: Recorder | None = None,
     every: int = 1,
     segment: int = 0,
+    debug: bool = False,
 ) -> Trace:
     """Run a filter over time: step k predicts over ``[t_{k-1}, t_k]``, then updates at ``t_k``.
 
@@ -47,13 +51,17 @@ def run(
         segment: Length of the segments whose inside is computed again by the backward pass, so that
             a gradient holds ``T / segment + segment`` states instead of ``T``, at the price of
             running forward once more; 0 is one segment. About ``sqrt(T)`` holds least.
+        debug: Whether every covariance is checked: that of the process noise, of the observation
+            noise and of the estimate must be finite, symmetric and positive semi-definite in each
+            step. Several times slower, and not within a transformation of JAX.
 
     Returns:
         The trace.
 
     Raises:
         ValueError: If the filter, its parameters or the observations are not what they must be, the
-            leading axes of inputs and observations differ, or are no multiple of ``every``.
+            leading axes of inputs and observations differ, or are no multiple of ``every``; with
+            ``debug``, if a covariance is none, with the first step at which it is not.
     """
     require_filter(filter)
     require_observations(observations)
@@ -66,11 +74,23 @@ def run(
         )
     if every < 1 or min(steps) % every:
         raise ValueError(f"every is {every}; {min(steps)} steps must be a multiple of it")
-    return _run(filter, record, every, segment, params, inputs, observations)
+    given = (params, inputs, observations)
+    if debug:
+        return _debugged(partial(_scan, filter, record, every, segment, debug=True), given)
+    return _run(filter, record, every, segment, *given)
 
 
-@compiled(static_argnums=(0, 1, 2, 3))
-def _run(
+def _debugged(scan: Callable[..., Trace], given: tuple[Any, Input, Obs]) -> Trace:
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given)):
+        raise ValueError("debug is True within a transformation of JAX; it must be run outside")
+    error, trace = jax.jit(checkify.checkify(scan, errors=checkify.user_checks))(*given)
+    said = error.get()
+    if said is not None:
+        raise ValueError(said.partition(" (`check` failed)")[0])
+    return trace
+
+
+def _scan(
     filter: Filter,
     record: Recorder | None,
     every: int,
@@ -78,12 +98,16 @@ def _run(
     params: Params,
     inputs: Input,
     observations: Obs,
+    debug: bool = False,
 ) -> Trace:
-    def advance(state: Any, now: tuple[Input, Obs]) -> tuple[Any, Any]:
-        u, obs = now
-        return filter.update(params, filter.predict(params, state, u), u, obs)
+    def advance(state: Any, now: tuple[Input, Obs, Array | None]) -> tuple[Any, Any]:
+        u, obs, index = now
+        with checking(index):
+            state, info = filter.update(params, filter.predict(params, state, u), u, obs)
+            check_covariance("the covariance of the estimate", lambda: filter.estimate(state).cov)
+        return state, info
 
-    def step(state: Any, now: tuple[Input, Obs]) -> tuple[Any, Any]:
+    def step(state: Any, now: tuple[Input, Obs, Array | None]) -> tuple[Any, Any]:
         if every > 1:
             state, infos = jax.lax.scan(advance, state, now)
             info = jax.tree.map(lambda leaf: leaf[-1], infos)
@@ -92,11 +116,14 @@ def _run(
         kept = (filter.estimate(state), info) if record is None else record(state, info)
         return state, kept
 
-    over = (inputs, observations)
+    over = (inputs, observations, jnp.arange(len(observations.valid)) if debug else None)
     if every > 1:
         over = jax.tree.map(lambda leaf: leaf.reshape(-1, every, *leaf.shape[1:]), over)
     final, kept = scan_in_segments(step, filter.init(params), over, segment)
     return Trace(kept, final)
+
+
+_run = compiled(_scan, static_argnums=(0, 1, 2, 3))
 
 
 def scan_in_segments(

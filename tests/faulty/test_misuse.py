@@ -58,6 +58,10 @@ def study(run_one: Any = lambda key, shared: jn.RunOutput(0.0), key: Any = None,
     return lambda: jn.monte_carlo(run_one, jax.random.key(0) if key is None else key, runs)
 
 
+CURVED = {
+    "transition": MODEL._replace(transition=lambda p, x, u: jnp.sin(x)),
+    "observe": MODEL._replace(observe=lambda p, x, u: x * x[::-1]),
+}
 EYE = jnp.eye(2)
 TWO = MEMBERS._replace(model=jnp.ones(2))
 MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
@@ -66,6 +70,14 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         r"^filter is the function kf; it must be a Filter, as jaxnav\.ekf\(model\)",
     ),
     "a model for a filter": (filtered(filter=MODEL), r"^filter is a Model; it must be a Filter"),
+    "a nonlinear transition": (
+        filtered(filter=jn.kf(CURVED["transition"])),
+        r"^the derivative of the model's transition depends on the state; a linear filter needs",
+    ),
+    "a nonlinear observation": (
+        filtered(filter=jn.square_root_kf(CURVED["observe"])),
+        r"^the derivative of the model's observe depends on the state; .* the ekf takes all",
+    ),
     "an array for observations": (
         filtered(z=jnp.zeros((STEPS, 2))),
         r"^observations is an array \(4, 2\) of float64; it must be Obs\(z, valid\)",

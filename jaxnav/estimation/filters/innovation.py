@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.estimation.checks import ROUNDING
+from jaxnav.estimation.debugging import check_covariance
 from jaxnav.estimation.types import Flag, Info, Model, Obs, SureObs, flags_of
 from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
 from jaxnav.numerics.linalg import Cholesky, cholesky, log_det, solve_lower
@@ -63,6 +64,7 @@ def heard(R: Array, obs: Obs) -> Heard:
         )
     variance = R if R.ndim == 1 else jnp.diag(R)
     known = obs.valid & (variance != jnp.inf)
+    check_covariance("the observation noise", lambda: mask_noise(R, known))
     broken = jnp.zeros(m, bool) if isinstance(obs, SureObs) else ~jnp.isfinite(obs.z)
     unknown = jnp.isnan(variance)
     if R.ndim == 2:
@@ -158,6 +160,7 @@ def require_step(model: Model, x: Any, moved: Any, Q: Array) -> None:
     n = jax.eval_shape(model.local, x, moved).shape[0]
     if Q.shape != (n, n):
         raise ValueError(f"the process noise is {Q.shape}; it must be ({n}, {n}), as the state")
+    check_covariance("the process noise", lambda: Q)
 
 
 def _shapes(shapes: list[tuple[int, ...]]) -> str:

@@ -74,7 +74,7 @@ def kf(model: Model) -> Filter:
 
     Raises:
         ValueError: If the model has a ``retract``, ``local`` or ``jacobians`` of its own; in a run,
-            if shapes do not fit together.
+            if shapes do not fit together or the model is not linear in the state.
 
     Range: on the ill-conditioned update of Grewal and Andrews the covariance is right to 1e-7 for a
     ratio of measurement to prior sigma of 1e-6 in float64, to 1e-3 for 3e-3 in float32; beyond

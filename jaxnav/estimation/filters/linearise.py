@@ -12,6 +12,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.interpreters import partial_eval
 
 from jaxnav.estimation.types import Input, LinearMap, Model, Params, Point
 from jaxnav.numerics.linalg import matmul
@@ -52,7 +53,8 @@ def with_itself_as_jacobians(model: Model) -> Model:
     """Return a linear model whose Jacobians are its own functions, free of matrices.
 
     Raises:
-        ValueError: If the model has slots that a linear filter does not use.
+        ValueError: If the model has slots that a linear filter does not use; in a run, if a
+            derivative depends on the state (:func:`is_affine`).
     """
     unused = ("retract", "local", "jacobians")
     own = [name for name in unused if getattr(model, name) is not Model._field_defaults[name]]
@@ -63,12 +65,40 @@ def with_itself_as_jacobians(model: Model) -> Model:
         )
 
     def jacobians(params: Params, x: Array, u: Input) -> tuple[LinearMap, LinearMap]:
-        return (
-            lambda dx: jax.jvp(lambda x: model.transition(params, x, u), (x,), (dx,))[1],
-            lambda dx: jax.jvp(lambda x: model.observe(params, x, u), (x,), (dx,))[1],
-        )
+        def pushed(name: str) -> Callable[[Array], Array]:
+            function = getattr(model, name)
+
+            def push(dx: Array) -> Array:
+                if not is_affine(lambda x: function(params, x, u), x):
+                    raise ValueError(
+                        f"the derivative of the model's {name} depends on the state; a linear "
+                        "filter needs one that does not, the ekf takes all (and so it does where a "
+                        "loop of unknown length hides that it does not)"
+                    )
+                return jax.jvp(lambda x: function(params, x, u), (x,), (dx,))[1]
+
+            return push
+
+        return pushed("transition"), pushed("observe")
 
     return model._replace(jacobians=jacobians)
+
+
+def is_affine(function: Callable[[Array], Array], x: Array) -> bool:
+    """Return whether the derivative of a function is the same at every point.
+
+    That is read off the operations and not off values: it costs tracing alone, holds under any
+    transformation, and takes a derivative that depends on the point in form alone for one that
+    does, as that of a product with what turns out to be one, or of a ``while`` loop.
+
+    Args:
+        function: Of a vector ``(n,)``.
+        x: A vector, of which shape and type matter.
+    """
+    point = jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x))
+    traced = jax.make_jaxpr(lambda x, dx: jax.jvp(function, (x,), (dx,))[1])(point, point).jaxpr
+    _, used = partial_eval.dce_jaxpr(traced, [True] * len(traced.outvars))
+    return not used[0]
 
 
 def jacobians(model: Model, params: Params, x: Point, u: Input, n: int) -> tuple[Array, Array]:
