@@ -88,7 +88,7 @@ def _list(rest: list[str]) -> int:
     if _no_options("list", rest):
         print("usage: jaxnav list")
         return OK
-    from jaxnav.report import print_catalogue
+    from jaxnav.report.catalogue import print_catalogue
 
     print_catalogue()
     return OK
@@ -119,7 +119,8 @@ def _run(rest: list[str]) -> int:
     if parsed is None:
         return OK
     configure_jax(cache=parsed.cache)
-    from jaxnav.report import Progress, print_json, print_result
+    from jaxnav.report.console import Progress
+    from jaxnav.report.study import print_json, print_result
     from jaxnav.results import claim_directory, write
 
     study.load("check")(parsed.config)
@@ -160,7 +161,8 @@ def _tune(rest: list[str]) -> int:
     if parsed is None:
         return OK
     configure_jax(cache=parsed.cache)
-    from jaxnav.report import Progress, print_document, print_tuning
+    from jaxnav.report.console import Progress, print_document
+    from jaxnav.report.tuning import print_parameters, print_tuning
     from jaxnav.results import claim_directory, finite_or_null, write_arrays, write_document
     from jaxnav.studies.base import plain
     from jaxnav.tuning.analysis import tune
@@ -168,6 +170,9 @@ def _tune(rest: list[str]) -> int:
 
     require_x64()
     problem = study.load("tuning")(parsed.study) if study else _log_problem(name, parsed.study)
+    if parsed.config.list:
+        print_parameters(problem.parameters)
+        return OK
     directory = claim_directory(parsed.out)
     with Progress(quiet=parsed.json, unit="steps") as progress:
         report = tune(name, plain(parsed.study), problem, parsed.config, progress)
@@ -220,7 +225,8 @@ def _filter(rest: list[str]) -> int:
     from jaxnav.recorded.config import check
     from jaxnav.recorded.figures import draw
     from jaxnav.recorded.outputs import write_trajectory
-    from jaxnav.report import Progress, print_document, print_filter
+    from jaxnav.report.console import Progress, print_document
+    from jaxnav.report.drive import print_filter
     from jaxnav.results import claim_directory, finite_or_null, write_document
 
     require_x64()
@@ -253,7 +259,8 @@ def _allan(rest: list[str]) -> int:
     configure_jax(cache=parsed.cache)
     from jaxnav.noise_report.analysis import analyse, load
     from jaxnav.noise_report.figures import draw
-    from jaxnav.report import print_allan, print_document
+    from jaxnav.report.console import print_document
+    from jaxnav.report.noise import print_allan
     from jaxnav.results import claim_directory, finite_or_null, write_arrays, write_document
 
     require_x64()

@@ -59,6 +59,17 @@ def test_a_track_is_tuned_and_judged(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+def test_what_can_be_tuned_is_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["tune", "immae", "--list", "--study.duration-s", "6"]) == OK
+    said = capsys.readouterr().out
+    for word in ("reset_threshold", "0.9", "between 0 and 1", "weight that allows"):
+        assert word in said
+    assert not list(tmp_path.iterdir())
+
+
 @recorded
 def test_what_is_not_tuned_stays(tmp_path: Path) -> None:
     options = ("--params", "switching", "--start", "q=0.02,0.1,1,9")

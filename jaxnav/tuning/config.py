@@ -15,6 +15,7 @@ class TuneConfig:
     """Parameters of a study by gradient: fitted, validated, and judged on runs held out.
 
     Attributes:
+        list: Print what can be tuned, where it starts and within what domain, and end.
         params: Names of the parameters to tune; the others keep their hand-set values. All by
             default.
         start: Where to begin instead of at the hand-set values, as NAME=VALUE; entries of an array
@@ -33,6 +34,7 @@ class TuneConfig:
         profile_points: Points of each parameter's profile of the loss, odd; 0 leaves them out.
     """
 
+    list: bool = False
     params: tuple[str, ...] = ()
     start: tuple[str, ...] = ()
     bounds: tuple[str, ...] = ()
