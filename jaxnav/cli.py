@@ -297,8 +297,6 @@ def configure_jax(*, cache: bool = True) -> None:
     jax.config.update("jax_enable_compilation_cache", folder is not None)
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        if folder == program_cache.folder():
-            jax.config.update("jax_compilation_cache_max_size", program_cache.LIMIT_BYTES)
         # Most programs take less than the second below which JAX keeps none, and are hundreds.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

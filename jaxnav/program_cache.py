@@ -1,10 +1,12 @@
 """The compiled programs that are kept between processes: where, how many, and what spoils them.
 
 JAX keeps programs in a folder if it is given one, by default only those that took a second to
-compile, without a bound, and without a lock against a process beside it. A study has many that take
-less: here all are kept, in a folder of their own for each jax, jaxlib and kind of processor. JAX
-holds that folder within :data:`LIMIT_BYTES`, under a lock; folders of other versions go, those
-longest without use first, while all together take more than :data:`TOTAL_BYTES`.
+compile, and without a bound. A study has many that take less: here all are kept, in a folder of
+their own for each jax, jaxlib and kind of processor. When a process begins, what is longest without
+use goes: programs while that folder takes more than :data:`LIMIT_BYTES`, and folders of other
+versions while all together take more than :data:`TOTAL_BYTES`. JAX could hold the bound at all
+times, but looks at every file of the folder whenever it adds one: with the thousands of a few
+studies that takes longer than to compile.
 """
 
 import hashlib
@@ -63,7 +65,7 @@ def prepared() -> Path | None:
         with tempfile.NamedTemporaryFile(dir=chosen):
             pass
         if not given:
-            prune(TOTAL_BYTES, chosen)
+            prune(chosen, LIMIT_BYTES, TOTAL_BYTES)
     except OSError as error:
         _tell(f"compiled programs cannot be kept in {chosen} ({error.strerror}), so each")
         return None
@@ -77,20 +79,33 @@ def size(top: Path) -> tuple[int, int]:
     return len(sizes), sum(sizes)
 
 
-def prune(limit_bytes: int, kept: Path) -> None:
-    """Remove folders, that longest without use first, until all take no more than the limit.
+def prune(kept: Path, limit_bytes: int, total_bytes: int) -> None:
+    """Remove what is longest without use until folders take no more than they may.
 
     Args:
-        limit_bytes: The limit.
-        kept: The folder that stays whatever it takes.
+        kept: The folder in use, which stays and loses programs.
+        limit_bytes: What it may take.
+        total_bytes: What all may take; other folders go whole.
     """
+    stats = {path: path.stat() for path in kept.glob("*-cache")}
+    taken = sum(stat.st_size for stat in stats.values())
+    for path, stat in sorted(stats.items(), key=lambda item: _used(item[1])):
+        if taken <= limit_bytes:
+            break
+        taken -= stat.st_size
+        path.unlink(missing_ok=True)
     others = [path for path in root().iterdir() if path.is_dir() and path != kept]
     total = size(root())[1]
     for path in sorted(others, key=lambda path: path.stat().st_mtime):
-        if total <= limit_bytes:
+        if total <= total_bytes:
             return
         total -= size(path)[1]
         shutil.rmtree(path, ignore_errors=True)
+
+
+def _used(stat: os.stat_result) -> float:
+    """Return when a file was last read, which some systems do not note, or written."""
+    return max(stat.st_atime, stat.st_mtime)
 
 
 def _remove_spoiled_entries(chosen: Path) -> None:

@@ -24,8 +24,13 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Share compiled programs within this run, among its workers and commands; not with another."""
-    if not hasattr(config, "workerinput"):
+    """Share compiled programs within this run, a worker and its commands; not with another.
+
+    Two workers that write one entry at once read halves of it.
+    """
+    if hasattr(config, "workerinput"):
+        os.environ["XDG_CACHE_HOME"] += f"/{config.workerinput['workerid']}"
+    else:
         folder = tempfile.mkdtemp(prefix="jaxnav-tests-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["XDG_CACHE_HOME"] = folder

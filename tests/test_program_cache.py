@@ -79,8 +79,26 @@ def test_folders_of_other_versions_go_before_this_one(
         (folder / "jit_f-cache").write_bytes(bytes(100))
         os.utime(folder, (1e9 - age, 1e9 - age))
     this = program_cache.root() / "this"
-    program_cache.prune(250, this)
+    program_cache.prune(this, 250, 250)
     assert [path.parent.name for path in entries(tmp_path)] == ["older", "this"]
     assert program_cache.size(program_cache.root()) == (2, 200)
-    program_cache.prune(0, this)
+    program_cache.prune(this, 250, 0)
     assert [path.parent.name for path in entries(tmp_path)] == ["this"]
+
+
+def test_programs_longest_without_use_go_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    this = program_cache.root() / "this"
+    this.mkdir(parents=True)
+    for name, (read, written) in {"a": (30, 10), "b": (5, 20), "c": (10, 10)}.items():
+        path = this / f"{name}-cache"
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 + read, 1e9 + written))
+    program_cache.prune(this, 300, 300)
+    assert len(entries(tmp_path)) == 3
+    program_cache.prune(this, 299, 300)
+    assert [path.name for path in entries(tmp_path)] == ["a-cache", "b-cache"]
+    program_cache.prune(this, 100, 300)
+    assert [path.name for path in entries(tmp_path)] == ["a-cache"]
