@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.datasets.base import DataError
+from jaxnav.findings import faults
 from jaxnav.studies import STUDIES
 from jaxnav.studies.base import ConfigError, StudyResult, require_x64
 
@@ -138,7 +139,10 @@ def _run(rest: list[str]) -> int:
             print_result(result, target, figures)
     if parsed.json:
         print_json(results)
-    return DIVERGED if any(result.diverged for result in results) else OK
+    if any(result.diverged for result in results):
+        return DIVERGED
+    strict = getattr(parsed.config, "strict", False)
+    return FAULT if strict and any(faults(result.audit) for result in results) else OK
 
 
 def _tune(rest: list[str]) -> int:
@@ -183,7 +187,10 @@ def _tune(rest: list[str]) -> int:
         print_document(finite_or_null(report.document))
     else:
         print_tuning(report.document, directory, figures)
-    return DIVERGED if report.document["diverged"] else OK
+    if report.document["diverged"]:
+        return DIVERGED
+    strict = getattr(parsed.study, "strict", False)
+    return FAULT if strict and report.document["faults"] else OK
 
 
 def _log_problem(path: str, config: Any) -> Any:

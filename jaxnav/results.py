@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxnav.findings import document_of, faults
 from jaxnav.studies.base import ConfigError, StudyResult
 
 SCHEMA = 1
@@ -30,6 +31,8 @@ def summary(result: StudyResult) -> dict[str, Any]:
             "methods": result.methods,
             "published": result.published,
             "claims": [vars(claim) for claim in result.claims],
+            "audit": document_of(result.audit),
+            "faults": faults(result.audit),
             "notes": result.notes,
         }
     )

@@ -1,10 +1,12 @@
 """The study gnss-track: figures on the recorded drive, and answers to logs that are not right."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jaxnav.cli import FAULT, OK, main
 from jaxnav.datasets.base import DataError
 from jaxnav.studies.base import ConfigError
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
@@ -39,11 +41,13 @@ def test_thinned_drive_has_a_fix_a_second() -> None:
     assert likelihood["markov"] > likelihood["immae"] > likelihood["mmae"]
 
 
-def write_log(path: Path, seconds: list[float], velocity: bool = True) -> Path:
-    """A straight drive to the north at 10 m/s, written as RTKLIB would."""
+def write_log(
+    path: Path, seconds: list[float], velocity: bool = True, off: dict[float, float] | None = None
+) -> Path:
+    """A straight drive to the north at 10 m/s, written as RTKLIB would; fixes at times off by m."""
     lines = []
     for t in seconds:
-        latitude = 40.0 + np.degrees(10 * t / 6.37e6)
+        latitude = 40.0 + np.degrees((10 * t + (off or {}).get(t, 0.0)) / 6.37e6)
         clock = f"2025/07/08 19:{34 + int(t) // 60:02d}:{t % 60:06.3f}"
         row = f"{clock} {latitude:.9f} -105.0 1600.0 1 20 .01 .01 .01 0 0 0 0 0"
         lines.append(row + (" 10.0 0.0 0.0 .05 .05 .05 0 0 0" if velocity else ""))
@@ -61,6 +65,22 @@ def test_gap_is_predicted_over_and_a_repeated_time_is_counted(tmp_path: Path) ->
     assert result.diverged == 0
     assert result.arrays["time"].size == 119
     assert result.methods["kf-1"]["rmse"]["velocity"]["value"] < 2.0
+
+
+@pytest.mark.parametrize("off", [20.0, 1.1e3])
+def test_a_fix_that_is_off_is_a_fault_by_its_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], off: float
+) -> None:
+    seconds = [0.25 * k for k in range(200)]
+    log = write_log(tmp_path / "off.pos", seconds, off={30.0: off})
+    out = tmp_path / "out"
+    arguments = ["run", "gnss-track", "--log", str(log), "--out", str(out)]
+    assert main([*arguments, "--strict"]) == FAULT
+    (said,) = (line for line in capsys.readouterr().out.splitlines() if "fix 121" in line)
+    document = json.loads((out / "summary.json").read_text())
+    assert said.removeprefix("fault: ") in document["faults"]
+    assert {entry["verdict"] for entry in document["audit"]} <= {"pass", "doubt", "fault"}
+    assert main(arguments) == OK
 
 
 def test_log_without_velocity_is_not_scored_against_one(tmp_path: Path) -> None:

@@ -222,7 +222,6 @@ def test_a_drive_that_never_moves_is_refused() -> None:
 
 def test_the_likeliest_offset_is_the_injected_one() -> None:
     found = likeliest_offset(simulated()[0], replace(QUIET, time_offset_s=0.02))
-    assert found.found
     assert abs(found.value_s + INJECTED) < 0.003
     assert 0 < found.sigma_s < 0.003
 
@@ -426,7 +425,6 @@ def test_rtk_drive_tells_its_time_offset() -> None:
     """The likelihood at twice the rate is highest near what the search finds."""
     log = recorded("rtk_drive")
     found = likeliest_offset(log, FilterConfig())
-    assert found.found
 
     def likelihood(offset: float) -> float:
         config = FilterConfig(time_offset_s=offset, outages="off", constraints=False, rate_hz=20.0)

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Flag
+from jaxnav.findings import document_of, faults
 from jaxnav.navigation.models.vehicle import FIXES
 from jaxnav.recorded.audit import audit
 from jaxnav.recorded.config import FilterConfig, check, members
@@ -21,7 +22,6 @@ from jaxnav.recorded.experiments import (
     hide_and_score,
     single_model,
 )
-from jaxnav.recorded.findings import document_of, faults
 from jaxnav.recorded.methods import Kept, Method, filter_params, member_names, method
 from jaxnav.recorded.motion import since_start
 from jaxnav.recorded.offset import Offset, likeliest_offset
@@ -127,7 +127,7 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         "reference": reference and _reference_scores(reference),
         "outages": outages and _outage_scores(outages, config),
         "added_noise": noise and _noise_scores(noise, config),
-        "notes": notes + _notes(log, drive, config, offset),
+        "notes": notes + _notes(log, drive, config),
         "provenance": provenance(),
     }
     return Report(document, drive, kept, names, reference, outages, noise)
@@ -199,7 +199,7 @@ def _alignment(drive: Drive, config: FilterConfig, turned: np.ndarray) -> dict[s
 
 def _offset(config: FilterConfig, offset: Offset | None) -> dict[str, Any]:
     used = {"used_s": config.time_offset_s}
-    return used if offset is None else used | {"sigma_s": offset.sigma_s, "found": offset.found}
+    return used if offset is None else used | {"sigma_s": offset.sigma_s}
 
 
 def _filter_scores(drive: Drive, kept: Kept, off: np.ndarray) -> dict[str, Any]:
@@ -276,11 +276,9 @@ def _noise_scores(noise: NoiseScores, config: FilterConfig) -> dict[str, Any]:
     }
 
 
-def _notes(log: DriveLog, drive: Drive, config: FilterConfig, offset: Offset | None) -> list[str]:
+def _notes(log: DriveLog, drive: Drive, config: FilterConfig) -> list[str]:
     """Return what a reader must know, one sentence each."""
     notes = []
-    if offset is not None and not offset.found:
-        notes.append("the search for the likeliest time offset did not settle")
     if not drive.at_rest:
         notes.append("the vehicle was never at rest before it moved: levelled on the move")
     if drive.bridged_s > 5 * log.imu.step_s:

@@ -7,30 +7,21 @@ with wrong axes, sign, unit or clock shows there, whatever a filter makes of it.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Flag
+from jaxnav.findings import Finding, judged, memory_of, size_of
 from jaxnav.numerics.masks import runs_of
-from jaxnav.recorded.findings import Finding, judged
 from jaxnav.recorded.methods import Kept
 from jaxnav.recorded.motion import course_velocity, since_start
 from jaxnav.recorded.preparation import Drive
+from jaxnav.recorded.turning import COURSE_SPEED, SPAN_S, clocks, matched
 from jaxnav.units import DEG
 
-GRID_S = 0.1
-SPAN_S = 1.0
-"""Turns of the course and of the gyros are compared over so long, on a grid."""
-LAGS_S = 30.0
-"""Largest offset between the clocks that is looked for."""
-LEAST_POINTS = 20
-"""Points of two series that are compared at least."""
-LEAST_TURN = 3 * DEG
-"""Root mean square of the turn rate [rad/s] that a course must show to be compared at all."""
-COURSE_SPEED = 3.0
-"""Speed [m/s] from which on a velocity gives a course."""
+LEAST_TRACK = 20
+"""Fixes on end, and seconds, that show how speed grows."""
 
 
 def audit(log: DriveLog, drive: Drive, kept: Kept) -> list[Finding]:
@@ -124,77 +115,13 @@ def _receiver(log: DriveLog, drive: Drive) -> list[Finding]:
     ]
 
 
-class _Turns(NamedTuple):
-    """Turn rates to the left [rad/s] on the grid, by the course and by the z gyro; NaN unknown."""
-
-    course: np.ndarray
-    gyro: np.ndarray
-
-
-def _turns(log: DriveLog, drive: Drive) -> _Turns:
-    time = since_start(log.imu.time_ns, log)
-    grid = np.arange(time[0], time[-1], GRID_S)
-    rate = np.where(log.imu.valid, log.imu.gyro[:, 2], 0.0)
-    angle = np.concatenate([[0.0], np.cumsum(rate[1:] * np.diff(time))])
-    turned = np.interp(grid, time, angle)
-    velocity = course_velocity(log.fixes)
-    speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    fast = speed > COURSE_SPEED
-    course = np.full(len(grid), np.nan)
-    if fast.sum() > 2:
-        fix_time = since_start(log.fixes.time_ns, log) + drive.offset_s
-        left = np.unwrap(-np.arctan2(velocity[fast, 0], velocity[fast, 1]))
-        course = np.interp(grid, fix_time[fast], left, left=np.nan, right=np.nan)
-        # Between fast fixes that are far apart nothing is known.
-        after = np.clip(np.searchsorted(fix_time[fast], grid), 1, fast.sum() - 1)
-        wide = fix_time[fast][after] - fix_time[fast][after - 1] > 1.5
-        course[wide] = np.nan
-    span = round(SPAN_S / GRID_S)
-
-    def over_span(angle: np.ndarray) -> np.ndarray:
-        return (angle[span:] - angle[:-span]) / SPAN_S
-
-    rates = over_span(course)
-    # A turn of the course beyond half a turn a second is a reversal, or noise at walking pace.
-    rates[np.abs(rates) > 2.0] = np.nan
-    gyro = over_span(turned)
-    return _Turns(rates, gyro - np.median(gyro))
-
-
-def _matched(
-    a: np.ndarray, b: np.ndarray, lag: int = 0, least: int = LEAST_POINTS
-) -> tuple[float, float]:
-    """Return correlation, and slope of ``b`` over ``a``, with ``a`` taken so many points later.
-
-    Fewer than ``least`` points in common tell nothing: a correlation of 0.
-    """
-    if lag >= 0:
-        a, b = a[lag:], b[: len(b) - lag]
-    else:
-        a, b = a[:lag], b[-lag:]
-    known = np.isfinite(a) & np.isfinite(b)
-    if known.sum() < least:
-        return 0.0, math.nan
-    a, b = a[known] - a[known].mean(), b[known] - b[known].mean()
-    both = float(a @ b)
-    size = math.sqrt(float(a @ a) * float(b @ b))
-    correlation = both / size if size > 0 else 0.0
-    return min(1.0, max(-1.0, correlation)), float(b @ b) / both if both else math.nan
-
-
 def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
     """Judge the vertical gyro and the clocks by the course of the fixes."""
-    course, gyro = _turns(log, drive)
-    known = np.isfinite(course)
     names = ("course against gyro", "scale of the gyro", "clocks")
-    if known.sum() < 200 or np.sqrt(np.mean(course[known] ** 2)) < LEAST_TURN:
+    found = clocks(log, drive.offset_s)
+    if found is None:
         return [Finding(name, "not seen", math.nan, (0.0, 0.0), "") for name in names]
-    most = min(round(LAGS_S / GRID_S), len(course) // 3)
-    lags, enough = np.arange(-most, most + 1), int(known.sum()) // 2
-    found = np.array([_matched(course, gyro, int(lag), enough)[0] for lag in lags])
-    best = int(np.argmax(np.abs(found)))
-    strength, late = float(found[best]), float(lags[best]) * GRID_S
-    here, slope = _matched(course, gyro, int(lags[best]), enough)
+    strength, late = found.correlation, found.late_s
     agree = judged(
         names[0],
         strength,
@@ -204,12 +131,12 @@ def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
         f"the course of the fixes and the z gyro turn against each other (correlation "
         f"{strength:.2f}): the gyro's sign is reversed, or z points down"
         if strength < -0.6
-        else f"the z gyro does not turn as the course of the fixes does (correlation {here:.2f} at "
-        "best): check axes, units and clocks of the inertial sensors",
+        else f"the z gyro does not turn as the course of the fixes does (correlation "
+        f"{strength:.2f} at best): check axes, units and clocks of the inertial sensors",
     )
     if abs(strength) < 0.6:
         return [agree, *(Finding(name, "not seen", math.nan, (0.0, 0.0), "") for name in names[1:])]
-    ratio = abs(slope)
+    ratio = abs(found.slope)
     scale = judged(
         names[1],
         ratio,
@@ -219,16 +146,16 @@ def _turning(log: DriveLog, drive: Drive) -> list[Finding]:
         f"the z gyro turns {ratio:.3g} times as fast as the course of the fixes: "
         + ("its unit is not that of the header" if not 0.2 < ratio < 5 else "its scale is wrong"),
     )
-    clocks = judged(
+    apart = judged(
         names[2],
         late,
         (-0.35, 0.35),
         (-0.6, 0.6),
         "s",
         f"the fixes are {abs(late):.1f} s {'late' if late > 0 else 'early'} against the inertial "
-        f"samples; try --time-offset-s {drive.offset_s - late:.2f}, or --tune-offset from there",
+        f"samples; try --tune-offset, or --time-offset-s {drive.offset_s - late:.2f}",
     )
-    return [agree, scale, clocks]
+    return [agree, scale, apart]
 
 
 def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
@@ -239,7 +166,7 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
     fix_time = since_start(log.fixes.time_ns, log) + drive.offset_s
     inside = np.isfinite(speed) & (fix_time > time[0]) & (fix_time < time[-1])
     grid = np.arange(time[0], time[-1], SPAN_S)
-    if inside.sum() < LEAST_POINTS or len(grid) < LEAST_POINTS:
+    if inside.sum() < LEAST_TRACK or len(grid) < LEAST_TRACK:
         return [Finding("forward axis", "not seen", math.nan, (0.0, 0.0), "")]
     seen = np.interp(grid, fix_time[inside], speed[inside])
     moving = (seen[1:] > 1.0) & (seen[:-1] > 1.0)
@@ -249,9 +176,9 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
         force = np.where(log.imu.valid, log.imu.accel[:, axis], 0.0)
         total = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(time))])
         gains.append(np.diff(np.interp(grid, time, total)) / SPAN_S)
-    if moving.sum() < LEAST_POINTS or surge[moving].std() < 0.2:
+    if moving.sum() < LEAST_TRACK or surge[moving].std() < 0.2:
         return [Finding("forward axis", "not seen", math.nan, (0.0, 0.0), "")]
-    along, across = (_matched(surge[moving], gain[moving])[0] for gain in gains)
+    along, across = (matched(surge[moving], gain[moving])[0] for gain in gains)
     told = (
         "points backward"
         if along < -0.3 and abs(along) > abs(across)
@@ -275,6 +202,16 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
 _GROUPS = ("velocities", "positions", "constraints")
 
 
+def _constraints(value: float) -> Finding:
+    """Judge the NIS of the constraints: what they say is rougher than noise, and may be small."""
+    says = f"the constraints have a NIS of {value:.3g} per channel" + (
+        ": the vehicle slips or the mounting is wrong; try --constraints off"
+        if value > 1
+        else "; --steered-sigma may be smaller"
+    )
+    return judged("NIS, constraints", value, (0.01, 4.0), (0.0, 10.0), "", says)
+
+
 def _innovations(drive: Drive, kept: Kept) -> list[Finding]:
     """Judge the run's innovations: their size, their memory, what was refused."""
     findings = []
@@ -282,45 +219,14 @@ def _innovations(drive: Drive, kept: Kept) -> list[Finding]:
     for i, group in enumerate(_GROUPS):
         total = int(channels[:, i].sum())
         value = float(nis[:, i].sum()) / total if total > 30 else math.nan
-        says = (
-            f"the {group} are {value**0.5:.3g} times as far from their prediction as their "
-            f"standard deviations say (NIS {value:.3g} per channel)"
-        )
         if group == "constraints":
-            says += (
-                ": the vehicle slips or the mounting is wrong; try --constraints off"
-                if value > 1
-                else "; --steered-sigma may be smaller"
-            )
-            findings.append(judged(f"NIS, {group}", value, (0.01, 4.0), (0.0, 10.0), "", says))
+            findings.append(_constraints(value))
             continue
-        says += (
-            ": noise is larger than stated, or a sensor is wrong; the standard deviations of the "
-            "result are too small"
-            if value > 1
-            else ": the noise is stated too large; the standard deviations of the result are too "
-            "large, and outliers pass"
-        )
-        findings.append(judged(f"NIS, {group}", value, (0.2, 3.0), (0.05, 10.0), "", says))
+        findings.append(size_of(group, value))
     at = drive.fix_step
-    used = channels[at, 1] > 0
-    white = (np.asarray(kept.innovation) / np.asarray(kept.innovation_sigma))[at][used][:, 3:5]
-    memory = math.nan
-    if len(white) > 50:
-        both = np.sum(white[1:] * white[:-1])
-        memory = float(both / np.sum(white * white))
-    findings.append(
-        judged(
-            "memory of positions",
-            memory,
-            (-0.5, 0.8),
-            (-0.8, 0.95),
-            "",
-            f"what the positions are off lasts from fix to fix (correlation {memory:.2f}): the "
-            "filter follows them too slowly, or their errors last, and its standard deviations "
-            "are too small",
-        )
-    )
+    white = (np.asarray(kept.innovation) / np.asarray(kept.innovation_sigma))[at]
+    for i, axes in enumerate((slice(0, 3), slice(3, 5))):
+        findings.append(memory_of(_GROUPS[i], white[channels[at, i] > 0][:, axes]))
     flags = np.asarray(kept.flags)[at]
     share = float(np.mean((flags & (Flag.REFUSED | Flag.REOPENED)) > 0)) if len(at) else math.nan
     findings.append(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.compiling import compiled
+from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
@@ -18,6 +19,7 @@ from jaxnav.numerics.linalg import cholesky, solve_lower
 from jaxnav.recorded.config import ALONE, FilterConfig
 from jaxnav.recorded.methods import filter_params
 from jaxnav.recorded.preparation import prepare
+from jaxnav.recorded.turning import clocks
 
 STEPS = 6
 CLOSE_S = 5e-4
@@ -26,12 +28,17 @@ LARGEST_STEP_S = 0.2
 """The first order in the offset is good for less than that; a step back is half of that before."""
 
 
+AGREE = 0.6
+"""Correlation of two turn rates from which on their lag is believed."""
+APART_S = 0.3
+"""Lag above which the search begins there; below, it finds the way from where it is."""
+
+
 class Offset(NamedTuple):
-    """The likeliest offset [s], its standard deviation [s], and whether the search ended there."""
+    """The likeliest offset [s] and its standard deviation [s]."""
 
     value_s: float
     sigma_s: float
-    found: bool
 
 
 def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
@@ -43,15 +50,19 @@ def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
         step = sum(dl/dt) / sum(dnu/dt' inv(S) dnu/dt)
 
     The standard deviation is the inverse root of the denominator: of an ideal filter, and so too
-    small where other errors act like an offset.
+    small where other errors act like an offset. The search begins where the course of the fixes
+    turns as the gyros do, which is found from half a minute away.
 
     Args:
         log: The drive.
-        config: The configuration; the search starts from its offset.
+        config: The configuration; the search starts from its offset, or nearby.
+
+    Raises:
+        DataError: If the search does not settle.
     """
     plain = replace(config, **ALONE)
     filter = ekf(vehicle(constrained=False))
-    value, sigma, step = config.time_offset_s, float("nan"), 0.0
+    value, sigma, step = _nearby(log, config.time_offset_s), float("nan"), 0.0
     for _ in range(STEPS):
         drive = prepare(log, replace(plain, time_offset_s=value), config.noise_rate_hz)
         form = error_form("additive", drive.initial.mean.position)
@@ -69,7 +80,21 @@ def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
         value += step
         if abs(step) < CLOSE_S:
             break
-    return Offset(value, sigma, abs(step) < CLOSE_S)
+    else:
+        raise DataError(
+            f"{log.source}: the search for the likeliest time offset did not settle; at "
+            f"{value:.3f} s it still moved by {abs(step):.3f} s; accepted is a drive that turns "
+            "and changes its speed, or an offset by --time-offset-s"
+        )
+    return Offset(value, sigma)
+
+
+def _nearby(log: DriveLog, offset_s: float) -> float:
+    """Return an offset [s] near the likeliest: one given, unless course and gyro turn apart."""
+    found = clocks(log, offset_s)
+    if found is None or abs(found.correlation) < AGREE or abs(found.late_s) < APART_S:
+        return offset_s
+    return offset_s - found.late_s
 
 
 @compiled(static_argnums=0)

@@ -15,7 +15,9 @@ from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.tune.transforms import POSITIVE, UNIT, between
 from jaxnav.estimation.types import Filter, Info, Obs
+from jaxnav.findings import Finding
 from jaxnav.navigation.models.vehicle import FIXES
+from jaxnav.recorded.audit import audit
 from jaxnav.recorded.config import FilterConfig, members
 from jaxnav.recorded.methods import filter_params, method
 from jaxnav.recorded.offset import likeliest_offset
@@ -77,6 +79,10 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
             for name, of in (("tuned", values), ("hand-set", hand_set))
         }
 
+    def audited(values: Values) -> list[Finding]:
+        kept = run(chosen.filter, params_of(values), *whole, record=chosen.record).record
+        return audit(log, drive, kept)
+
     parameters = _parameters(plain)
     return Problem(
         parameters=parameters,
@@ -95,6 +101,7 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
         optimiser="lbfgs",
         simulated=False,
         mode="forward",
+        audit=audited,
         notes=(
             "fixes of a receiver depend on each other, which makes standard deviations too small",
         ),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import rich.progress
 from rich.console import Console
+from rich.markup import escape
 
 
 class Progress:
@@ -75,3 +76,13 @@ def values_text(value: Any) -> str:
         return ""
     entries = np.ravel(value)
     return " ".join(f"{entry:.4g}" for entry in entries)
+
+
+def print_findings(console: Console, audit: list[dict[str, Any]]) -> None:
+    """Print what is in doubt and what is a fault, a sentence each."""
+    for finding in audit:
+        if finding["verdict"] in ("doubt", "fault"):
+            colour = "red" if finding["verdict"] == "fault" else "yellow"
+            console.print(
+                f"[{colour}]{finding['verdict']}: {escape(finding['says'])}", soft_wrap=True
+            )

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxnav.report.console import number, with_error
+from jaxnav.report.console import number, print_findings, with_error
 
 SHOWN = 8
 """Refused fixes that are named on the screen; ``summary.json`` names all."""
@@ -40,12 +40,7 @@ def print_filter(document: dict[str, Any], directory: Path, figures: list[Path])
     )
     turned = ", ".join(f"{angle:.2f}" for angle in start["mounting_deg"])
     console.print(f"mounting {start['mounting']}: {turned} deg", soft_wrap=True)
-    for finding in document["audit"]:
-        if finding["verdict"] in ("doubt", "fault"):
-            colour = "red" if finding["verdict"] == "fault" else "yellow"
-            console.print(
-                f"[{colour}]{finding['verdict']}: {escape(finding['says'])}", soft_wrap=True
-            )
+    print_findings(console, document["audit"])
     if document["refused"]:
         shown = ", ".join(
             f"{entry['fix']} ({entry['time_s']:.6g} s)" for entry in document["refused"][:SHOWN]

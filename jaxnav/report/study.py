@@ -7,7 +7,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxnav.report.console import number, print_document, with_error
+from jaxnav.findings import document_of
+from jaxnav.report.console import number, print_document, print_findings, with_error
 from jaxnav.results import summary
 from jaxnav.studies.base import Claim, StudyResult
 
@@ -18,6 +19,7 @@ NOT_SHOWN = ("anees_dof", "log_likelihood_se")
 def print_result(result: StudyResult, directory: Path, figures: list[Path]) -> None:
     """Print the table of methods, the claims with their verdicts, and where the files are."""
     console = Console()
+    print_findings(console, document_of(result.audit))
     console.print(_method_table(result))
     if result.claims:
         console.print(_claim_table(result.claims))

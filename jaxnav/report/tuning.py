@@ -8,12 +8,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxnav.report.console import values_text, with_error
+from jaxnav.report.console import print_findings, values_text, with_error
 
 
 def print_tuning(document: dict[str, Any], directory: Path, figures: list[Path]) -> None:
     """Print what a tuning found and how it does on the runs held out."""
     console = Console()
+    print_findings(console, document["audit"])
     console.print(_parameter_table(document))
     fit, loss = document["fit"], document["loss"]
     console.print(

@@ -7,6 +7,8 @@ from functools import partial
 from types import NoneType
 from typing import Any, get_args
 
+from jaxnav.findings import Finding
+
 MOST_RUNS = 10**9
 """Most runs of a study, whose rows are all kept."""
 
@@ -230,6 +232,7 @@ class StudyResult:
             holds that axis' coordinates and needs no entry in ``dims``.
         dims: Per array, the names of all its axes.
         notes: Sentences for the reader of the table.
+        audit: What the innovations of recorded data say.
     """
 
     study: str
@@ -243,6 +246,7 @@ class StudyResult:
     arrays: dict[str, Any] = field(default_factory=dict)
     dims: dict[str, tuple[str, ...]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    audit: list[Finding] = field(default_factory=list)
 
     @property
     def diverged(self) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.estimation.tune.transforms import Transform
+from jaxnav.findings import Finding
 
 Values = dict[str, Array]
 """Parameters by name."""
@@ -79,6 +80,7 @@ class Problem(NamedTuple):
             and there is nothing to validate on.
         mode: Mode of differentiation, as for :func:`~jaxnav.estimation.tune.fit.fit`.
         notes: Sentences for the reader of the result.
+        audit: Judges the innovations of recorded data at given values; ``None`` for simulated data.
     """
 
     parameters: Mapping[str, Parameter]
@@ -97,6 +99,7 @@ class Problem(NamedTuple):
     simulated: bool = True
     mode: str = "reverse"
     notes: tuple[str, ...] = ()
+    audit: Callable[[Values], list[Finding]] | None = None
 
 
 def hand_set(problem: Problem) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from jaxnav.estimation.tune.inspect import (
     fisher,
     profile,
 )
+from jaxnav.findings import document_of, faults
 from jaxnav.results import SCHEMA, provenance
 from jaxnav.studies.base import ConfigError, plain
 from jaxnav.studies.tuned import Measure, Problem
@@ -94,6 +95,7 @@ def tune(
     diverged = max((_diverged(scores) for scores in held_out.values()), default=0)
     profiled, missing = _profiled(found.params, chosen, losses, config)
     known, unknown = _uncertainty(problem, found.params, chosen, losses, config)
+    findings = [] if problem.audit is None else problem.audit(found.params)
     document = {
         "schema": SCHEMA,
         "command": "tune",
@@ -109,6 +111,8 @@ def tune(
         "held_out": {
             label: _verdict(scores, problem.measure) for label, scores in held_out.items()
         },
+        "audit": document_of(findings),
+        "faults": faults(findings),
         "diverged": diverged,
         "notes": [*problem.notes, *missing, *unknown, *_warnings(found, checked, diverged)],
     }

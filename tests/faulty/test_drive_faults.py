@@ -14,6 +14,7 @@ import pytest
 from jaxnav.datasets.base import DataError
 from jaxnav.recorded.analysis import Report, analyse
 from jaxnav.recorded.config import FilterConfig
+from jaxnav.recorded.offset import likeliest_offset
 from jaxnav.units import DEG
 from tests.faulty.car import AROUND, REVERSED, Leg, Sensed, Truth, drive, heading_error, logged
 
@@ -143,6 +144,18 @@ def test_the_clocks_are_told_by_how_much(seconds: float) -> None:
     assert abs(late - seconds) < 0.15
     (says,) = (s for s in found.report.document["faults"] if "--time-offset-s" in s)
     assert f"{'late' if seconds > 0 else 'early'} against" in says
+
+
+@pytest.mark.parametrize("seconds", [1.0, -18.0])
+def test_an_offset_is_found_from_far(seconds: float) -> None:
+    found = likeliest_offset(logged(shifted(seconds)(drive()[1])), CONFIG)
+    assert abs(found.value_s + seconds) < 3 * found.sigma_s < 0.05
+
+
+def test_an_offset_that_does_not_show_is_refused() -> None:
+    straight = drive(((10.0, 0.0, 0.0), (6.0, 9.0, 0.0), (100.0, 9.0, 0.0)))[1]
+    with pytest.raises(DataError, match=r"did not settle; .*; accepted is a drive that turns"):
+        likeliest_offset(logged(shifted(1.0)(straight)), CONFIG)
 
 
 @pytest.mark.parametrize("off", [20.0, 100.0, 1.1e3, 1.6e5])

@@ -37,6 +37,7 @@ class GnssTrackConfig:
         weight_floor: Lower bound of the "floor" bank's weights.
         switching: Probability per step that the "markov" bank's model changes.
         seed: Not used by a recorded log; kept in the summary.
+        strict: Whether a fault that the audit finds ends the command with exit code 4.
     """
 
     log: Path | None = None
@@ -50,6 +51,7 @@ class GnssTrackConfig:
     weight_floor: float = 1e-3
     switching: float = 0.02
     seed: int = 0
+    strict: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing.

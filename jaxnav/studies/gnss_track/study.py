@@ -18,7 +18,8 @@ from jaxnav.estimation.banks.weights import bayes, chain, fixed, floor, markov
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.metrics import root
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import FilterParams, Gaussian, Obs, WeightRule, replicate
+from jaxnav.estimation.types import FilterParams, Gaussian, Info, Obs, WeightRule, replicate
+from jaxnav.findings import Finding, judged, memory_of, size_of
 from jaxnav.navigation.earth import enu_from_geodetic
 from jaxnav.navigation.models.kinematic import (
     KinematicInput,
@@ -160,22 +161,24 @@ def _run_scenario(config: GnssTrackConfig, track: GnssTrack) -> StudyResult:
     rules = {**dict.fromkeys(config.single_ids, fixed()), **BANKS}
     comparison = panel(kf(MODEL), rules)
 
-    def record(state: Any, info: Any) -> tuple[Array, Array, Array]:
+    def record(state: Any, info: Any) -> tuple[Array, Array, Array, Array]:
         estimate = comparison.estimate(state)
         mean = jnp.stack([estimate[name].mean for name in rules])
         likelihood = jnp.stack([info[name].log_likelihood for name in rules])
-        return mean, likelihood, jnp.stack([jnp.exp(state.log_weights[name]) for name in BANKS])
+        weights = jnp.stack([jnp.exp(state.log_weights[name]) for name in BANKS])
+        return mean, likelihood, weights, jnp.stack([whitened(info[name]) for name in rules])
 
     params = panel_params(config, data)
     trace = run(comparison, params, data.inputs, data.observations, record=record)
-    mean, likelihood, weights = (np.asarray(leaf) for leaf in trace.record)
+    mean, likelihood, weights, white = (np.asarray(leaf) for leaf in trace.record)
+    best = int(np.argmax(likelihood.sum(axis=0)))
     return StudyResult(
         study="gnss-track",
         scenario=config.scenario,
         runs=1,
         seed=config.seed,
         config={**plain(config), "log": str(config.log)},
-        methods=_measures(tuple(rules), mean, likelihood, data),
+        methods=_measures(tuple(rules), mean, likelihood, white, data),
         published={},
         claims=[],
         arrays=_arrays(config, tuple(rules), mean, likelihood, weights, data),
@@ -188,7 +191,36 @@ def _run_scenario(config: GnssTrackConfig, track: GnssTrack) -> StudyResult:
             "doppler": ("time", "axis"),
         },
         notes=_notes(config, track, data),
+        audit=audit(white[:, best]),
     )
+
+
+def whitened(info: Info) -> Array:
+    """Return the innovation ``(2,)`` of an update over its standard deviations."""
+    return info.innovation / jnp.sqrt(jnp.diag(info.innovation_cov))
+
+
+def audit(white: np.ndarray) -> list[Finding]:
+    """Judge the whitened innovations ``(T, 2)`` of a run: their size and how they last.
+
+    The mean of a few that are off by kilometres says nothing of the rest, so that the largest is
+    judged by itself.
+    """
+    largest = float(np.max(np.abs(white)))
+    at = int(np.argmax(np.max(np.abs(white), axis=1))) + 2
+    return [
+        size_of("positions", float(np.mean(white**2))),
+        memory_of("positions", white),
+        judged(
+            "largest innovation",
+            largest,
+            (0.0, 20.0),
+            (0.0, 100.0),
+            "sigmas",
+            f"fix {at} of those used is {largest:.3g} standard deviations from its prediction: it "
+            "is off, or the receiver jumped; cut it out",
+        ),
+    ]
 
 
 def _arrays(
@@ -217,7 +249,11 @@ def _arrays(
 
 
 def _measures(
-    methods: tuple[str, ...], mean: np.ndarray, likelihood: np.ndarray, data: TrackData
+    methods: tuple[str, ...],
+    mean: np.ndarray,
+    likelihood: np.ndarray,
+    white: np.ndarray,
+    data: TrackData,
 ) -> dict[str, dict[str, Any]]:
     measures: dict[str, dict[str, Any]] = {}
     for i, name in enumerate(methods):
@@ -225,6 +261,7 @@ def _measures(
         entry: dict[str, Any] = {
             "log_likelihood": float(total.sum()),
             "log_likelihood_se": _block_se(total) * total.size,
+            "nis_per_channel": float(np.mean(white[:, i] ** 2)),
             "diverged": int(not np.all(np.isfinite(mean[:, i]))),
         }
         if data.velocity is not None:

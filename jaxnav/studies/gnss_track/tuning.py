@@ -15,6 +15,7 @@ from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.tune.transforms import POSITIVE, UNIT
 from jaxnav.estimation.types import Info, Obs, replicate
+from jaxnav.findings import Finding
 from jaxnav.navigation.models.kinematic import KinematicInput
 from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.gnss_track.config import SCENARIOS, GnssTrackConfig
@@ -23,10 +24,12 @@ from jaxnav.studies.gnss_track.study import (
     BLOCKS,
     MODEL,
     TrackData,
+    audit,
     filter_params,
     load,
     panel_params,
     track_data,
+    whitened,
 )
 from jaxnav.studies.tuned import Measure, Parameter, Problem, Values
 
@@ -73,7 +76,18 @@ def problem(config: GnssTrackConfig) -> Problem:
         optimiser="lbfgs",
         simulated=False,
         mode="forward",
+        audit=partial(_audited, config, data),
     )
+
+
+def _audited(config: GnssTrackConfig, data: TrackData, values: Values) -> list[Finding]:
+    def record(state: Any, info: Info) -> Array:
+        del state
+        return whitened(info)
+
+    params = _bank_params(config, data, values)
+    trace = run(BANK, params, data.inputs, data.observations, record=record)
+    return audit(np.asarray(trace.record))
 
 
 def _parameters(config: GnssTrackConfig) -> dict[str, Parameter]:
