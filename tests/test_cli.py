@@ -226,6 +226,8 @@ def test_list_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
     said = capsys.readouterr().out
     for word in ("immae", "noise-step", "square_root_kf", "windowed_reset", ".pos"):
         assert word in said
+    for mark in (":class:", ":func:", "``", "Return"):
+        assert mark not in said
     assert main(["doctor"]) == OK
     said = capsys.readouterr().out
     for word in ("jaxlib", "x64", "compiled programs", "compiler option"):

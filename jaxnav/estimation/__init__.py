@@ -3,9 +3,11 @@
 Knows nothing of navigation: a state-space model from any field is a :class:`~.types.Model`.
 """
 
+import re
+
 
 def catalogue() -> dict[str, dict[str, str]]:
-    """Return the filters, banks and weight rules with the first line of their documentation."""
+    """Return the filters, banks and weight rules, each with what it is in a line of plain words."""
     from jaxnav.estimation.banks import imm, mixture, reset, weights
     from jaxnav.estimation.filters import (
         adaptive,
@@ -51,6 +53,13 @@ def catalogue() -> dict[str, dict[str, str]]:
         ),
     }
     return {
-        title: {entry.__name__: (entry.__doc__ or "").splitlines()[0] for entry in entries}
+        title: {entry.__name__: _plain(entry.__doc__ or "") for entry in entries}
         for title, entries in groups.items()
     }
+
+
+def _plain(documentation: str) -> str:
+    """Return the first line of a documentation without its marks and what it returns it as."""
+    line = documentation.splitlines()[0].removeprefix("Return ")
+    line = re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", line)
+    return line.replace("``", "")

@@ -37,7 +37,8 @@ class Study(NamedTuple):
 
 STUDIES = {
     "immae": Study(
-        summary="SINS/CNS attitude with unknown process noise: KF, MMAE, IMMAE (Si, Wang, Niu)",
+        summary="attitude of a sounding rocket by gyros and a star tracker, process noise unknown: "
+        "a Kalman filter against banks of them (Si, Wang, Niu)",
         config="jaxnav.studies.immae.config:ImmaeConfig",
         entry="jaxnav.studies.immae.study:run_study",
         figures="jaxnav.studies.immae.figures:draw",
@@ -46,7 +47,8 @@ STUDIES = {
         check="jaxnav.studies.base:check_simulated",
     ),
     "mmae-ukf": Study(
-        summary="banks of EKF and UKF on a 300 s boost, total-state SINS/CNS (Zhao, Chen, He, Ge)",
+        summary="attitude of a launcher by inertial sensors and a star tracker, noise changing: "
+        "banks of extended and unscented filters (Zhao, Chen, He, Ge)",
         config="jaxnav.studies.mmae_ukf.config:MmaeUkfConfig",
         entry="jaxnav.studies.mmae_ukf.study:run_study",
         figures="jaxnav.studies.mmae_ukf.figures:draw",
@@ -55,7 +57,8 @@ STUDIES = {
         check="jaxnav.studies.base:check_simulated",
     ),
     "rkcns": Study(
-        summary="SINS aided by starlight refraction, iterated cubature filters (Shi, Chen, Wang)",
+        summary="position of a vehicle above the air by the refraction of starlight: "
+        "iterated cubature filters (Shi, Chen, Wang)",
         config="jaxnav.studies.rkcns.config:RkcnsConfig",
         entry="jaxnav.studies.rkcns.study:run_study",
         figures="jaxnav.studies.rkcns.figures:draw",
@@ -64,7 +67,8 @@ STUDIES = {
         check="jaxnav.studies.rkcns.study:check",
     ),
     "arekf": Study(
-        summary="MEMS-SINS/GNSS, noise identified before launch, and its rivals (Yang et al.)",
+        summary="a sounding rocket with cheap inertial sensors and GNSS, noise identified before "
+        "launch, against robust, invariant and adaptive filters (Yang et al.)",
         config="jaxnav.studies.arekf.config:ArekfConfig",
         entry="jaxnav.studies.arekf.study:run_study",
         figures="jaxnav.studies.arekf.figures:draw",
@@ -73,7 +77,8 @@ STUDIES = {
         check="jaxnav.studies.base:check_simulated",
     ),
     "sage-husa": Study(
-        summary="a vehicle's INS/GNSS whose fixes turn noisy: Sage-Husa UKF in banks (Song et al.)",
+        summary="a vehicle with inertial sensors and GNSS whose fixes turn noisy: "
+        "banks of filters that estimate the noise (Song et al.)",
         config="jaxnav.studies.sage_husa.config:SageHusaConfig",
         entry="jaxnav.studies.sage_husa.study:run_study",
         figures="jaxnav.studies.sage_husa.figures:draw",
@@ -82,7 +87,8 @@ STUDIES = {
         check="jaxnav.studies.base:check_simulated",
     ),
     "gnss-track": Study(
-        summary="a recorded GNSS track through the same bank, judged by predictive likelihood",
+        summary="a recorded GNSS track through banks of constant-velocity filters, judged by "
+        "how well they predict the next fix",
         config="jaxnav.studies.gnss_track.config:GnssTrackConfig",
         entry="jaxnav.studies.gnss_track.study:run_study",
         figures="jaxnav.studies.gnss_track.figures:draw",

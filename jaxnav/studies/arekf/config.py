@@ -12,9 +12,9 @@ from jaxnav.studies.base import (
 )
 
 SCENARIOS = {
-    "noise-drift": "noise limits the filter: true noise is s times what the filters were given",
+    "noise-drift": "the inertial noise is a few times what the filters were told",
     "bias-dominated": "the same with a sensor whose bias limits the filter",
-    "r-sweep": "one EKF, its measurement noise mis-set by factors",
+    "r-sweep": "an extended filter told too little and too much noise of the fixes",
     "outliers": "known inertial noise, some fixes with ten times their noise",
     "large-heading-error": "known inertial noise, heading at launch wrong by tens of degrees",
 }

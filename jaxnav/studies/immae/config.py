@@ -16,8 +16,8 @@ from jaxnav.studies.base import (
 )
 
 SCENARIOS = {
-    "matched-noise": "simulation 1: true noise Q0 throughout, single Kalman filter at 4 Q0",
-    "noise-step": "simulation 2: true noise Q0, 10 Q0, Q0 in thirds, single Kalman filter at Q0",
+    "matched-noise": "noise as nominal, and a single filter that believes four times that",
+    "noise-step": "ten times the nominal noise in the middle third of the flight",
 }
 
 
