@@ -50,9 +50,7 @@ def test_noise_that_is_none_is_named() -> None:
         process_noise=lambda p, x, u: 0.1 * jnp.eye(2),
         observation_noise=lambda p, x, u: jnp.array([1.0, 1.0 - 10 * u]),
     )
-    with pytest.raises(
-        ValueError, match=r"^the observation noise has the variance -1\.0 at step"
-    ):
+    with pytest.raises(ValueError, match=r"^the observation noise has the variance -1\.0 at step"):
         jn.run(jn.kf(noisy), PARAMS, at_two, Z, debug=True)
     unheard = Z._replace(valid=Z.valid.at[2, 1].set(False))
     jn.run(jn.kf(noisy), PARAMS, at_two, unheard, debug=True)

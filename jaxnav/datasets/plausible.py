@@ -14,6 +14,9 @@ _MISMATCH = 8.0
 _HEIGHTS = (-1e3, 1e5)
 _STRETCH_S = 10.0
 _FAR = 30.0
+_HIGH = 3.0
+_MANY_STRETCHES = 20
+_JUMPS, _BEYOND = 100.0, 1e4
 _LOOKS = {"g": 1.0, "m/s^2 where the header says g": GRAVITY**2, "mg": 1000.0}
 
 
@@ -62,6 +65,10 @@ def check_fixes(
       ``s . d / max(|s|, |d|)^2`` below a half in the median, ``s`` being the integral of the
       velocity and ``d`` the change of the position: a velocity, a position or the time in another
       unit, or axes in another order.
+    * Over the same stretches, where the vertical velocity climbs or sinks by ten times the noise,
+      a height that changes by less than half or more than twice of that: feet.
+    * Positions that jump to and fro by 100 m and ten thousand times their standard deviation in the
+      median: baselines in metres read as degrees.
 
     Args:
         time_ns: ``(T,) [ns]``.
@@ -85,9 +92,12 @@ def check_fixes(
                 f"the {name} of fix {first + 1} is {values[first]:.9g} {unit}; accepted is one "
                 f"from {low:.6g} to {high:.6g} {unit}"
             )
+    _check_scatter(geodetic, sigma)
     if velocity is not None:
         noise = 0.0 if sigma is None else float(np.nanmedian(sigma[:, :2]))
         _check_way(time_ns, geodetic, velocity[:, :2], max(_FAR, 10 * noise))
+        above = 0.0 if sigma is None else float(np.nanmedian(sigma[:, 2]))
+        _check_climb(time_ns, geodetic[:, 2], velocity[:, 2], max(_HIGH, 10 * above))
 
 
 def _check_way(
@@ -98,12 +108,8 @@ def _check_way(
 ) -> None:
     known = np.isfinite(velocity).all(axis=1)
     time, place, velocity = (time_ns[known] - time_ns[0]) / 1e9, geodetic[known], velocity[known]
-    mean = (velocity[1:] + velocity[:-1]) / 2
-    way = np.concatenate([np.zeros((1, 2)), np.cumsum(mean * np.diff(time)[:, None], axis=0)])
-    end = np.searchsorted(time, time + _STRETCH_S)
-    begin = np.flatnonzero(end < len(time))
-    begin = begin[time[end[begin]] - time[begin] < 2 * _STRETCH_S]
-    end = end[begin]
+    way = _travelled(time, velocity)
+    begin, end = _stretches(time)
     told = way[end] - way[begin]
     turn = np.remainder(place[end] - place[begin] + np.pi, 2 * np.pi) - np.pi
     moved = MEAN_RADIUS * np.stack([turn[:, 1] * np.cos(place[begin, 0]), turn[:, 0]], axis=1)
@@ -117,6 +123,58 @@ def _check_way(
             f"in ten seconds the positions move by {moved_m:.4g} m and the velocities by "
             f"{told_m:.4g} m, or elsewhere; accepted are fixes that agree, so check units and axes"
         )
+
+
+def _check_climb(
+    time_ns: NDArray[np.int64],
+    height: NDArray[np.float64],
+    climb: NDArray[np.float64],
+    least: float,
+) -> None:
+    known = np.isfinite(climb)
+    time, height = (time_ns[known] - time_ns[0]) / 1e9, height[known]
+    way = _travelled(time, climb[known, None])[:, 0]
+    begin, end = _stretches(time)
+    told, moved = way[end] - way[begin], height[end] - height[begin]
+    far = np.abs(told) > least
+    if far.sum() < _MANY_STRETCHES:
+        return
+    ratio = float(np.median(moved[far] / told[far]))
+    if not 0.5 < ratio < 2:
+        raise DataError(
+            f"the heights change {ratio:.3g} times as fast as the vertical velocities say; "
+            "accepted are heights in metres, so check their unit (feet would be 3.28)"
+        )
+
+
+def _check_scatter(geodetic: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> None:
+    if sigma is None or len(geodetic) < _MANY_STRETCHES:
+        return
+    level = np.unwrap(geodetic[:, :2], axis=0)
+    jump = np.linalg.norm(np.diff(level, 2, axis=0), axis=1)
+    scatter = float(np.median(jump)) * MEAN_RADIUS
+    stated = float(np.nanmedian(sigma[:, :2]))
+    if scatter > max(_JUMPS, _BEYOND * stated):
+        raise DataError(
+            f"the positions jump to and fro by {scatter:.3g} m, {scatter / stated:.2g} times their "
+            "standard deviation; accepted are latitude and longitude in degrees, which baselines "
+            "in metres are not"
+        )
+
+
+def _travelled(time: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the integral of a velocity ``(T, k)`` over time."""
+    mean = (velocity[1:] + velocity[:-1]) / 2
+    steps = mean * np.diff(time)[:, None]
+    return np.concatenate([np.zeros((1, velocity.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def _stretches(time: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where stretches of :data:`_STRETCH_S`, hardly longer ones, begin and end."""
+    end = np.searchsorted(time, time + _STRETCH_S)
+    begin = np.flatnonzero(end < len(time))
+    begin = begin[time[end[begin]] - time[begin] < 2 * _STRETCH_S]
+    return begin, end[begin]
 
 
 def _check_force(accel: NDArray[np.float64]) -> None:

@@ -30,18 +30,30 @@ REST_SIGMA = (0.5 * DEG, 5 * DEG, 0.03 * DEG)
 """Of tilt and heading [rad] and gyro drift [rad/s] after a rest; the heading is a course."""
 MOVING_SIGMA = (3 * DEG, 5 * DEG, 0.5 * DEG)
 """The same when the vehicle was moving from the first sample on, and hardly turned meanwhile."""
+MOST_DRIFT, UNKNOWN_DRIFT = 1.5 * DEG, 2.0 * DEG
+"""A mean rate above the first, on the move, is a manoeuvre and no drift [rad/s]; the drift is then
+unknown by the second, which is that of a poor sensor."""
 VELOCITY_SIGMA = 0.3
 BIAS_SIGMA = 0.2
 """Of the accelerometer bias [m/s^2], each axis: 20 mg, as data sheets of MEMS sensors have it."""
 
 
 class Start(NamedTuple):
-    """The start: its sample, state, whether it is from a rest, and sigma of the course [rad]."""
+    """The start of a filter.
+
+    Attributes:
+        sample: Its inertial sample.
+        state: The state there.
+        at_rest: Whether it is from a rest.
+        course_sigma: Standard deviation of the course [rad].
+        drift_sigma: Of the gyro drift ``(3,) [rad/s]``.
+    """
 
     sample: int
     state: SinsLevel
     at_rest: bool
     course_sigma: float
+    drift_sigma: np.ndarray
 
 
 def start_of(
@@ -74,7 +86,8 @@ def start_of(
     turns = (log.imu.gyro[part] - gyro) * np.diff(time[part], append=time[sample])[:, None]
     ahead = _direction(log, time, fix_time, speed, moving[0]) * velocity[moving[0]]
     dcm = _headed(jnp.asarray(accel), jnp.asarray(turns), jnp.asarray(ahead))
-    return _started(log, sample, moving[0], dcm, jnp.asarray(gyro), at_rest=True)
+    sigma = np.full(3, REST_SIGMA[2])
+    return _started(log, sample, moving[0], dcm, gyro, sigma, at_rest=True)
 
 
 def _direction(
@@ -117,7 +130,7 @@ def _last_rest(still: np.ndarray, shortest: int) -> slice | None:
 def _moving_start(log: DriveLog, time: np.ndarray, fix_time: np.ndarray, first: int) -> Start:
     """Return a start from the move: level by the force less what speed and bends make of it.
 
-    The mean rate less that of the course is taken for the drift.
+    The mean rate less that of the course is taken for the drift, unless it is more than one.
 
     Raises:
         DataError: If the fixes do not go on for the time to level by.
@@ -140,7 +153,10 @@ def _moving_start(log: DriveLog, time: np.ndarray, fix_time: np.ndarray, first: 
     surge = np.array([(speed[1] - speed[0]) / lasted, np.mean(speed) * left, 0.0])
     force = np.mean(log.imu.accel[part], axis=0) - surge
     dcm = _headed(jnp.asarray(force), jnp.zeros((1, 3)), jnp.asarray(velocity[later[0]]))
-    return _started(log, end, int(later[0]), dcm, jnp.asarray(drift), at_rest=False)
+    believed = np.abs(drift) < MOST_DRIFT
+    sigma = np.where(believed, MOVING_SIGMA[2], UNKNOWN_DRIFT)
+    drift = np.where(believed, drift, 0.0)
+    return _started(log, end, int(later[0]), dcm, drift, sigma, at_rest=False)
 
 
 @compiled
@@ -154,12 +170,20 @@ def _headed(force: Array, turns: Array, velocity: Array) -> Array:
 
 
 def _started(
-    log: DriveLog, sample: int, fix: int, dcm: Array, drift: Array, *, at_rest: bool
+    log: DriveLog,
+    sample: int,
+    fix: int,
+    dcm: Array,
+    drift: np.ndarray,
+    drift_sigma: np.ndarray,
+    *,
+    at_rest: bool,
 ) -> Start:
     velocity = np.nan_to_num(course_velocity(log.fixes)[fix])
     position = jnp.asarray(log.fixes.geodetic[fix])
-    state = SinsLevel(dcm, jnp.asarray(velocity), position, drift, jnp.zeros(3))
-    return Start(sample, state, at_rest, _course_sigma(log.fixes, fix, velocity))
+    state = SinsLevel(dcm, jnp.asarray(velocity), position, jnp.asarray(drift), jnp.zeros(3))
+    sigma = _course_sigma(log.fixes, fix, velocity)
+    return Start(sample, state, at_rest, sigma, drift_sigma)
 
 
 def _course_sigma(fixes: GnssTrack, fix: int, velocity: np.ndarray) -> float:
@@ -172,7 +196,7 @@ def _course_sigma(fixes: GnssTrack, fix: int, velocity: np.ndarray) -> float:
 
 def initial(start: Start, position_noise: np.ndarray) -> Gaussian:
     """Return the state at a start with its covariance in additive errors."""
-    tilt, heading, drift = REST_SIGMA if start.at_rest else MOVING_SIGMA
+    tilt, heading, _ = REST_SIGMA if start.at_rest else MOVING_SIGMA
     heading = math.hypot(heading, start.course_sigma)
     # The fix is up to a sample old, and of the antenna.
     position = np.sqrt(position_noise**2 + 1.0)
@@ -180,7 +204,7 @@ def initial(start: Start, position_noise: np.ndarray) -> Gaussian:
         [tilt, tilt, heading],
         np.full(3, VELOCITY_SIGMA),
         position,
-        np.full(3, drift),
+        start.drift_sigma,
         np.full(3, BIAS_SIGMA),
     ]
     sigma = np.concatenate(blocks)

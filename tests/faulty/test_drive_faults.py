@@ -264,3 +264,55 @@ def test_noise_that_is_stated_makes_no_fix_implausible() -> None:
     noise = 5.0 * METRE * rng.normal(size=sensed.place.shape) * [1.0, 1.5, 0.0]
     log = logged(sensed._replace(place=sensed.place + noise, sigma=np.full_like(sensed.sigma, 5.0)))
     assert len(log.fixes.time_ns) == len(sensed.fix_time)
+
+
+@pytest.mark.slow
+def test_a_roll_at_a_moving_start_is_no_drift() -> None:
+    """A lean of twelve degrees and back, at up to nine degrees a second."""
+    truth, sensed = drive()
+    begin = 52.0
+    part, fixes = sensed.time >= begin, sensed.fix_time >= begin
+    cut = Sensed(
+        *(leaf[part] for leaf in sensed[:3]), *(np.asarray(leaf)[fixes] for leaf in sensed[3:])
+    )
+    time = cut.time - begin
+    lean = 12 * DEG * np.sin(2 * np.pi * time / 8) * (time < 4)
+    sine, cosine = np.sin(lean), np.cos(lean)
+    leant = [v @ np.diag([1.0, 0.0, 0.0]) for v in (cut.gyro, cut.accel)]
+    for out, v in zip(leant, (cut.gyro, cut.accel), strict=True):
+        out[:, 1] = cosine * v[:, 1] + sine * v[:, 2]
+        out[:, 2] = -sine * v[:, 1] + cosine * v[:, 2]
+    leant[0][:, 0] += np.gradient(lean, time)
+    rolled = Sensed(time, *leant, cut.fix_time - begin, *cut[4:])
+    found = outcome(truth, rolled)
+    heading = heading_error(
+        truth, found.report.drive.time + begin, np.asarray(found.report.kept.mean.dcm)
+    )
+    assert np.all(np.abs(heading) < 5 * found.sigma[:, 2])
+    drift = np.asarray(found.report.document["filter"]["gyro_drift_dps"])
+    assert np.max(np.abs(drift)) < 0.5
+
+
+def test_heights_in_feet_and_baselines_for_degrees_are_refused() -> None:
+    _, sensed = drive()
+    assert sensed.velocity is not None
+    hill = 20 * np.sin(sensed.fix_time / 12)
+    climb = 20 / 12 * np.cos(sensed.fix_time / 12)
+    level = sensed.place * [1.0, 1.0, 0.0]
+    up = np.stack([0 * climb, 0 * climb, climb], axis=1)
+    hilly = sensed._replace(velocity=sensed.velocity + up)
+    for unit, refused in ((1.0, False), (3.28084, True)):
+        place = level + np.stack([0 * hill, 0 * hill, unit * (300 + hill)], axis=1)
+        if not refused:
+            logged(hilly._replace(place=place))
+            continue
+        with pytest.raises(DataError, match=r"heights change 3\.\d+ times as fast as the vertical"):
+            logged(hilly._replace(place=place))
+    rng = np.random.default_rng(7)
+    baseline = np.array([12 * DEG, -30 * DEG, 2.0])
+    parked = baseline + np.deg2rad(0.004) * rng.normal(size=sensed.place.shape) * [1, 1, 0]
+    parked = sensed._replace(place=parked, velocity=None, sigma=np.full_like(sensed.sigma, 0.004))
+    with pytest.raises(
+        DataError, match=r"jump to and fro by 1\.\d+e\+03 m, .* baselines in metres"
+    ):
+        logged(parked)
