@@ -103,7 +103,7 @@ FAULTS = {
     ),
     "degrees as radians": Fault(
         lambda rng, time, values: (time, values * np.repeat([180 / np.pi, 1], 3)),
-        refused="the unit may be another",
+        refused="look like deg/s",
     ),
     "a gyro that swings": Fault(_swung, refused="gyro_z moves by"),
     "a dead axis": Fault(_dead, noted="gyro_y: constant"),

@@ -26,13 +26,13 @@ def test_a_log_with_a_fault_is_right_or_refused(name: str) -> None:
     """A sample of ``checks/allan_faults.py``: one seed; the random walks within 8 %."""
     fault = FAULTS[name]
     rng = np.random.default_rng(SEED)
-    log = log_of(*fault.spoil(rng, *clean(rng, COUNT)))
+    rows = fault.spoil(rng, *clean(rng, COUNT))
     if fault.refused:
         with pytest.raises(DataError, match=fault.refused) as caught:
-            prepare(log, AllanConfig())
+            prepare(log_of(*rows), AllanConfig())
         assert "accepted" in str(caught.value)
         return
-    document, _ = analyse(prepare(log, AllanConfig()), AllanConfig())
+    document, _ = analyse(prepare(log_of(*rows), AllanConfig()), AllanConfig())
     found = walks(document)[:, 0]
     found = found[np.isfinite(found)]
     assert len(found) == 5 if fault.noted else 6
