@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.ad_checkpoint import checkpoint_name
 
-from jaxnav.numerics.linalg import Cholesky, log_det, matmul, solve_lower, solve_positive
+from jaxnav.numerics.linalg import Cholesky, kernel, log_det, matmul, solve_lower, solve_positive
 
 KEPT = "solved"
 """Name of what is better kept for a backward pass than computed again."""
@@ -37,6 +37,7 @@ class Solved(NamedTuple):
     weighed: Array
 
 
+@kernel
 def solved(S: Array, root: Cholesky, nu: Array) -> Solved:
     """Return what the derivatives need; a program that takes none does not compute it."""
     inverse = solve_positive(root.factor, S, jnp.eye(S.shape[0], dtype=S.dtype))

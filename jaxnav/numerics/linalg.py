@@ -16,6 +16,11 @@ from jax import Array
 
 from jaxnav.numerics.products import UNROLL_LIMIT, product
 
+kernel = jax.jit
+"""Has a function traced once for each shape, wherever and however often it is used: a filter is
+traced through its transformations many times, and what is written out in multiply-adds is most of
+it. The compiler takes the call apart again."""
+
 
 def symmetrise(A: Array) -> Array:
     """Return the symmetric part ``(A + A') / 2`` of a matrix ``(n, n)``."""
@@ -81,6 +86,7 @@ class Cholesky(NamedTuple):
     reciprocal_pivot: Array
 
 
+@kernel
 def cholesky(S: Array) -> Cholesky:
     """Factor a symmetric matrix ``(m, m)``; a failed factorisation is reported, never NaN.
 
@@ -140,6 +146,7 @@ def invertible(L: Array) -> tuple[Array, Array]:
     return jnp.where(jnp.all(jnp.isfinite(L)), whole, jnp.eye(L.shape[0], dtype=L.dtype)), good
 
 
+@kernel
 def _eliminated_unrolled(S: Array) -> Elimination:
     zero = jnp.zeros((), S.dtype)
     L: list[list[Array]] = []
@@ -156,6 +163,7 @@ def _eliminated_unrolled(S: Array) -> Elimination:
     return Elimination(jnp.stack(rows), jnp.stack(pivots))
 
 
+@kernel
 def _eliminated_rolled(S: Array) -> Elimination:
     index = jnp.arange(S.shape[0])
 
@@ -179,6 +187,7 @@ def _dot(a: list[Array], b: list[Array]) -> Array | int:
     return sum((x * y for x, y in zip(a, b, strict=True)), 0)
 
 
+@kernel
 def solve_lower(L: Array, B: Array) -> Array:
     """Return ``inv(L) B`` by substitution; lower ``L`` ``(m, m)``, ``B`` ``(m, n)`` or ``(m,)``."""
     m = L.shape[0]
@@ -190,6 +199,7 @@ def solve_lower(L: Array, B: Array) -> Array:
     return jnp.stack(rows)
 
 
+@kernel
 def solve_lower_transposed(L: Array, B: Array) -> Array:
     """Return ``inv(L') B`` by back substitution; shapes as in :func:`solve_lower`."""
     m = L.shape[0]

@@ -9,7 +9,7 @@ is transposed into products, which fuse as well.
 from typing import Any
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -35,9 +35,12 @@ def product(A: Array, B: Array) -> Array:
 
 
 def _written_out(A: Array, B: Array) -> Array:
-    inner = A.shape[-1]
-    columns, rows = jnp.split(A, inner, axis=-1), jnp.split(B, inner, axis=-2)
-    return sum((columns[j] * rows[j] for j in range(1, inner)), columns[0] * rows[0])
+    axis = A.ndim - 1
+    terms = [
+        lax.slice_in_dim(A, j, j + 1, axis=axis) * lax.slice_in_dim(B, j, j + 1, axis=axis - 1)
+        for j in range(A.shape[-1])
+    ]
+    return sum(terms[1:], terms[0])
 
 
 def _shape(A: Any, B: Any) -> ShapedArray:

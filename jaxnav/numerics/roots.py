@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.numerics.linalg import UNROLL_LIMIT, eliminated, invertible, solve_lower
+from jaxnav.numerics.linalg import UNROLL_LIMIT, eliminated, invertible, kernel, solve_lower
 
 
 class SemidefiniteRoot(NamedTuple):
@@ -27,6 +27,7 @@ class SemidefiniteRoot(NamedTuple):
     semidefinite: Array
 
 
+@kernel
 def semidefinite_root(A: Array) -> SemidefiniteRoot:
     """Factor a positive semi-definite matrix ``(n, n)``; one that is not is reported.
 
@@ -129,6 +130,7 @@ def update_array(root: Array, seen: Array, L: Array) -> Array:
     return jnp.block([[root, seen], [zero, L]])
 
 
+@kernel
 def _turned(root: Array, seen: Array, L: Array) -> tuple[Array, Array]:
     """Return the first columns ``(m + n, m)`` of the update's triangle, and what is left of ``L``.
 
@@ -156,6 +158,7 @@ def _turned(root: Array, seen: Array, L: Array) -> tuple[Array, Array]:
     return jnp.stack(columns, axis=1), array
 
 
+@kernel
 def _reflected(L: Array, A: Array) -> Array:
     """Return ``tria([L, A])`` by Householder reflections, one for each row.
 
@@ -189,6 +192,7 @@ def _largest(A: Array) -> Array:
     return jnp.where(largest > 0, largest, 1)
 
 
+@kernel
 def _tangent(L: Array, A: Array, dA: Array) -> Array:
     """Return the derivative of ``L = tria(A)`` along ``dA`` ``(n, k)``.
 
@@ -201,6 +205,7 @@ def _tangent(L: Array, A: Array, dA: Array) -> Array:
     return L @ (jnp.tril(X) + jnp.triu(X, 1).T)
 
 
+@kernel
 def downdate(L: Array, v: Array) -> SemidefiniteRoot:
     """Return the lower factor of ``L L' - v v'``, by hyperbolic rotations in mixed form.
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from jaxnav.estimation.checks import ROUNDING
 from jaxnav.estimation.debugging import check_covariance
 from jaxnav.estimation.types import Flag, Info, Model, Obs, SureObs, flags_of
 from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
-from jaxnav.numerics.linalg import Cholesky, cholesky, log_det, solve_lower
+from jaxnav.numerics.linalg import Cholesky, cholesky, kernel, log_det, solve_lower
 from jaxnav.numerics.roots import semidefinite_root
 
 ILL_CONDITIONED_EPS = 1e3
@@ -117,6 +118,7 @@ def heard_by(model: Model, params: Any, x: Any, u: Any, obs: Obs) -> Heard:
     return heard(model.observation_noise(params, x, u), obs)
 
 
+@kernel
 def mask_noise(R: Array, valid: Array) -> Array:
     """Return the noise covariance ``(m, m)`` with the identity in channels that are not valid.
 
@@ -141,6 +143,7 @@ def nis_of(info: Info, channels: Sequence[int]) -> Array:
     return jnp.sum(white * white)
 
 
+@kernel
 def is_covariance(P: Array) -> Array:
     """Return whether a matrix ``(n, n)`` is symmetric and positive semi-definite, to rounding."""
     sigma = jnp.sqrt(jnp.maximum(jnp.diag(P), 0))
@@ -167,6 +170,7 @@ def _shapes(shapes: list[tuple[int, ...]]) -> str:
     return ", ".join(map(str, shapes))
 
 
+@partial(kernel, static_argnames="rooted")
 def innovation_info(
     nu: Array,
     S: Array,
