@@ -1,7 +1,7 @@
 """Runs over time: the only ``lax.scan`` over filter time."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -76,14 +76,20 @@ def run(
         raise ValueError(f"every is {every}; {min(steps)} steps must be a multiple of it")
     given = (params, inputs, observations)
     if debug:
-        return _debugged(partial(_scan, filter, record, every, segment, debug=True), given)
+        return _debugged(_checked(filter, record, every, segment), given)
     return _run(filter, record, every, segment, *given)
 
 
-def _debugged(scan: Callable[..., Trace], given: tuple[Any, Input, Obs]) -> Trace:
+@cache
+def _checked(filter: Filter, record: Recorder | None, every: int, segment: int) -> Any:
+    scan = partial(_scan, filter, record, every, segment, debug=True)
+    return jax.jit(checkify.checkify(scan, errors=checkify.user_checks))
+
+
+def _debugged(scan: Any, given: tuple[Any, Input, Obs]) -> Trace:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given)):
         raise ValueError("debug is True within a transformation of JAX; it must be run outside")
-    error, trace = jax.jit(checkify.checkify(scan, errors=checkify.user_checks))(*given)
+    error, trace = scan(*given)
     said = error.get()
     if said is not None:
         raise ValueError(said.partition(" (`check` failed)")[0])

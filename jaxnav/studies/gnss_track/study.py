@@ -96,7 +96,10 @@ def load(config: GnssTrackConfig) -> GnssTrack:
     """Return the track of a configuration; raises as :func:`run_study` does."""
     require_x64()
     if config.log is None:
-        raise ConfigError("log is not given; it must be the path of an RTKLIB .pos file")
+        raise ConfigError(
+            "log is not given; it must be the path of an RTKLIB .pos file, by --log, or by "
+            "--study.log where it is tuned"
+        )
     return load_rtklib_pos(config.log)
 
 
