@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-NAMES = ("throughput", "filters", "gradient", "compile_time", "scaling", "gpu")
+NAMES = ("throughput", "filters", "gradient", "compile_time", "commands", "scaling", "gpu")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
