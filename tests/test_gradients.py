@@ -234,7 +234,7 @@ DECOMPOSITIONS = {"eig", "eigh", "eigvals", "eigvalsh", "svd", "svdvals", "sqrtm
 
 
 def test_no_decomposition_without_a_derivative_is_on_a_differentiated_path() -> None:
-    """Their derivatives are NaN at repeated values; those left are of a host's, or of checks alone."""
+    """Their derivatives are NaN at repeated values; those left are of a host or of checks."""
     root, found = Path(jaxnav.__file__).parent, set()
     for folder in ("numerics", "estimation", "navigation"):
         for path in sorted((root / folder).rglob("*.py")):

@@ -140,3 +140,25 @@ def test_the_gate_holds_in_32_bits() -> None:
     inputs = jnp.zeros((STEPS, 1), jnp.float32)
     flags = jn.run(gated(jn.kf(model), GROUPS), params, inputs, obs).record[1].flags
     np.testing.assert_array_equal(np.flatnonzero(flags & Flag.REFUSED), [50])
+
+
+@pytest.mark.parametrize("left_out", ["not finite", "infinite variance", "not valid"])
+def test_channels_that_are_not_used_do_not_widen_the_gate(left_out: str) -> None:
+    """A square of 12 is beyond one in a thousand for one channel, and not for two."""
+    fixed = MODEL._replace(
+        transition=lambda p, x, u: x,
+        process_noise=lambda p, x, u: jnp.zeros((2, 2)),
+        observation_noise=lambda p, x, u: jnp.array([1.0, jnp.where(u > 0, jnp.inf, 1.0)]),
+    )
+    known = jn.FilterParams(jnp.array(1.0), jn.Gaussian(jnp.zeros(2), 1e-12 * jnp.eye(2)))
+    obs = jn.Obs(jnp.array([[12**0.5, 0.0]]), jnp.array([[True, left_out != "not valid"]]))
+    if left_out == "not finite":
+        obs = obs._replace(z=obs.z.at[0, 1].set(jnp.nan))
+    inputs = jnp.array([1.0 if left_out == "infinite variance" else 0.0])
+    gate = Gate(jnp.array(1e-3), jnp.array(5.0))
+    alone = gated(jn.kf(fixed), ((0, 1),))
+    _, info = jn.run(alone, Gated(known, gate), inputs, obs).record
+    assert int(info.flags[0]) & Flag.REFUSED
+    both = jn.Obs(jnp.array([[12**0.5, 0.0]]), jnp.ones((1, 2), bool))
+    _, info = jn.run(alone, Gated(known, gate), jnp.zeros(1), both).record
+    assert not int(info.flags[0]) & Flag.REFUSED

@@ -88,7 +88,8 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
     def update(params: Gated, state: GatedState, u: Input, obs: Obs) -> tuple[GatedState, Info]:
         plain = filter.update(params.inner, state.inner, u, obs)
         squares = jnp.stack([nis_of(plain[1], group) for group in groups])
-        count = jnp.stack([jnp.sum(obs.valid[np.array(group)]) for group in groups])
+        used = obs.valid & ~_left_out(plain[1])
+        count = jnp.stack([jnp.sum(used[np.array(group)]) for group in groups])
         heard = count > 0
         dtype = squares.dtype
         opened = jnp.exp(-state.refused.astype(dtype) / params.gate.patience)
@@ -123,6 +124,12 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
         return state._replace(inner=filter.restart(state.inner, given))
 
     return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
+
+
+def _left_out(info: Info) -> Array:
+    """Return which channels ``(m,)`` an update did not use, whatever the reason."""
+    alone = jnp.eye(len(info.innovation), dtype=info.innovation.dtype)
+    return (info.innovation == 0) & jnp.all(info.innovation_cov == alone, axis=1)
 
 
 def _tail(square: Array, count: Array) -> Array:
