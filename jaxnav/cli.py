@@ -3,9 +3,10 @@
 Imports of JAX and the studies wait until a command needs them, so that help is immediate.
 """
 
+import difflib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -70,12 +71,18 @@ def _dispatch(arguments: list[str]) -> int:
         "doctor": _doctor,
     }
     if command not in commands:
-        raise ConfigError(f"there is no command {command!r}; it must be {_either(commands)}")
+        raise ConfigError(f"there is no command {command!r}{_near(command, commands)}")
     return commands[command](rest)
 
 
 def _either(names: Any) -> str:
     return "one of " + ", ".join(names)
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    """Return what a name must be, with the nearest one if it looks like a slip."""
+    close = difflib.get_close_matches(name.lower().replace("_", "-"), names, 1)
+    return f"{f', did you mean {close[0]!r}' if close else ''}; it must be {_either(names)}"
 
 
 def _no_options(command: str, rest: list[str]) -> bool:
@@ -112,7 +119,7 @@ def _run(rest: list[str]) -> int:
         return OK if rest else BAD_INPUT
     name, options = rest[0], rest[1:]
     if name not in STUDIES:
-        raise ConfigError(f"there is no study {name!r}; it must be {_either(STUDIES)}")
+        raise ConfigError(f"there is no study {name!r}{_near(name, STUDIES)}")
     study = STUDIES[name]
     from jaxnav.options import parse_run
 
@@ -153,7 +160,7 @@ def _tune(rest: list[str]) -> int:
     recorded = name not in STUDIES
     if recorded and not Path(name).exists():
         raise ConfigError(
-            f"there is no study or log {name!r}; it must be a recorded drive or {_either(STUDIES)}"
+            f"there is no study or log {name!r}{_near(name, STUDIES)} or a recorded drive"
         )
     from jaxnav.options import parse_tune
     from jaxnav.recorded.config import FilterConfig
@@ -171,10 +178,12 @@ def _tune(rest: list[str]) -> int:
     from jaxnav.studies.base import plain
     from jaxnav.tuning.analysis import tune
     from jaxnav.tuning.figures import draw
+    from jaxnav.tuning.selection import select
 
     require_x64()
     problem = study.load("tuning")(parsed.study) if study else _log_problem(name, parsed.study)
     if parsed.config.list:
+        select(problem, parsed.config)
         print_parameters(problem.parameters)
         return OK
     directory = claim_directory(parsed.out)

@@ -81,12 +81,11 @@ def memory_of(group: str, white: np.ndarray) -> Finding:
     if len(white) > LEAST_WHITE:
         square = float(np.sum(white * white))
         memory = float(np.sum(white[1:] * white[:-1])) / square if square > 0 else math.nan
-    return judged(
-        f"memory of {group}",
-        memory,
-        (-0.5, 0.8),
-        (-0.8, 0.95),
-        "",
+    says = (
         f"what the {group} are off lasts from fix to fix (correlation {memory:.2f}): the filter "
-        "follows them too slowly, or their errors last, and its standard deviations are too small",
+        "follows them too slowly, or their errors last, and its standard deviations are too small"
+        if memory > 0
+        else f"what the {group} are off goes to and fro from fix to fix (correlation "
+        f"{memory:.2f}): the filter follows their noise, which is larger than it is told"
     )
+    return judged(f"memory of {group}", memory, (-0.5, 0.8), (-0.8, 0.95), "", says)

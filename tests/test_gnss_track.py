@@ -83,6 +83,23 @@ def test_a_fix_that_is_off_is_a_fault_by_its_number(
     assert main(arguments) == OK
 
 
+def test_velocities_of_another_unit_or_axis_are_refused(tmp_path: Path) -> None:
+    seconds = [0.25 * k for k in range(200)]
+    log = write_log(tmp_path / "plain.pos", seconds)
+    for old, new in ((" 10.0 0.0 0.0 ", " 36.0 0.0 0.0 "), (" 10.0 0.0 0.0 ", " 0.0 10.0 0.0 ")):
+        other = tmp_path / "other.pos"
+        other.write_text(log.read_text().replace(old, new))
+        with pytest.raises(DataError, match=r"other\.pos: in ten seconds the positions move by"):
+            run_study(GnssTrackConfig(log=other))
+
+
+def test_a_standard_deviation_unlike_that_of_the_log_is_told(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "plain.pos", [0.25 * k for k in range(80)])
+    for sigma, told in ((0.02, False), (0.5, True)):
+        (result,) = run_study(GnssTrackConfig(log=log, position_sigma=sigma))
+        assert any("states a standard deviation of 0.01 m" in note for note in result.notes) == told
+
+
 def test_log_without_velocity_is_not_scored_against_one(tmp_path: Path) -> None:
     log = write_log(tmp_path / "plain.pos", [0.25 * k for k in range(80)], velocity=False)
     (result,) = run_study(GnssTrackConfig(log=log))

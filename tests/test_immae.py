@@ -34,7 +34,9 @@ def test_banks_beat_the_single_filter_when_the_noise_steps() -> None:
     level = dict(zip(METHODS, result.arrays["mean_square"].mean(axis=(0, 2)), strict=True))
     assert level["immae"] < level["mmae"] < level["kf"]
     assert level["immae"] < 1.06 * level["oracle"]
-    assert all(c.verdict == "reproduced" for c in result.claims if c.id.startswith("immae-beats"))
+    gains = [c.measured for c in result.claims if c.id.startswith("immae-beats")]
+    assert gains
+    assert all(gain is not None and gain < 0 for gain in gains)
 
 
 def test_results_hold_every_method_and_published_table(short: list[StudyResult]) -> None:

@@ -136,7 +136,8 @@ def window(log: ImuLog, start_s: float = 0.0, end_s: float = math.inf) -> ImuLog
     inside = np.flatnonzero((since >= start_s) & (since <= end_s))
     if len(inside) < 2:
         raise DataError(
-            f"{log.source}: the window from {start_s} s to {end_s} s holds {len(inside)} samples; "
+            f"{log.source}: the window from {start_s} s to "
+            f"{'the end' if end_s == math.inf else f'{end_s} s'} holds {len(inside)} samples; "
             f"accepted is one with two or more, and the log lasts {since[-1]:.6g} s"
         )
     values = np.hstack([log.gyro, log.accel])[inside]

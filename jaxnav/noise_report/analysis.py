@@ -29,7 +29,13 @@ from jaxnav.navigation.sensors.noise_fit import (
     model_variance,
 )
 from jaxnav.noise_report.config import AllanConfig, check
-from jaxnav.noise_report.rest import doubts, quantum, without_spikes
+from jaxnav.noise_report.rest import (
+    coarse,
+    doubts,
+    quantum,
+    unlike_neighbours,
+    without_spikes,
+)
 from jaxnav.numerics.masks import runs_of
 from jaxnav.results import SCHEMA, provenance
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, GRAVITY, HOUR
@@ -122,7 +128,8 @@ def analyse(log: ImuLog, config: AllanConfig) -> tuple[dict[str, Any], dict[str,
     """
     log, spikes = without_spikes(log)
     count = len(log.valid)
-    sizes = cluster_sizes(count, config.per_octave)
+    shortest = unlike_neighbours(log)
+    sizes = tuple(m for m in cluster_sizes(count, config.per_octave) if m >= shortest)
     rates = jnp.asarray(np.hstack([log.gyro, log.accel]).T)
     valid = None if log.valid.all() else jnp.asarray(log.valid)
     measured, fit, freedom, by_median = _axes(rates, valid, log.step_s, sizes)
@@ -140,7 +147,12 @@ def analyse(log: ImuLog, config: AllanConfig) -> tuple[dict[str, Any], dict[str,
         "fit_tau": fit_tau,
         "fit_deviation": np.sqrt(np.asarray(curve)),
     }
-    notes = [*doubts(log), *_notes(measured, fit), *_unlike(log, measured, by_median)]
+    notes = [
+        *doubts(log),
+        *_sampled(log, shortest),
+        *_notes(measured, fit),
+        *_unlike(log, measured, by_median),
+    ]
     return _document(log, config, measured, fit, spikes, notes), arrays
 
 
@@ -224,8 +236,25 @@ def _notes(measured: AllanVariance, fit: NoiseFit) -> list[str]:
     if poor.any():
         notes.append(
             f"{', '.join(axes[poor])}: the four noises do not explain the Allan deviations (chi-"
-            f"square per degree of freedom up to {misfit.max():.0f}); coefficients and intervals "
-            "hold for a sensor at rest"
+            f"square per degree of freedom up to {misfit.max():.0f}), as with motion, a drift or "
+            "a filter in the sensor; do not rely on these coefficients and intervals"
+        )
+    return notes
+
+
+def _sampled(log: ImuLog, shortest: int) -> list[str]:
+    """Return what the samples are, if they are not the sensor's noise itself."""
+    notes = []
+    if shortest > 1:
+        notes.append(
+            "neighbouring samples are alike: the sensor filters or repeats them; clusters of less "
+            f"than {shortest} samples, {shortest * log.step_s:.3g} s, are left out"
+        )
+    steps = coarse(log)
+    if steps and shortest == 1:
+        notes.append(
+            f"{', '.join(steps)}: most samples repeat the one before: the output's steps are "
+            "larger than its noise, and the coefficients are those of the output, not the sensor's"
         )
     return notes
 

@@ -15,8 +15,8 @@ class AllanConfig:
         end_s: End of that part; by default that of the log.
         confidence: Probability of the intervals.
         per_octave: Cluster times in an octave.
-        accept_doubts: Analyse what looks like a wrong unit, swapped columns or a sensor that moves,
-            and tell the doubts as notes.
+        accept_doubts: Analyse what does not look like a rest: a sensor that moves, swapped columns,
+            an unlikely unit; the doubts are then notes. What no sensor gives stays refused.
     """
 
     start_s: float = 0.0

@@ -19,6 +19,12 @@ SPIKE = 12.0
 """Standard deviations from the median of its neighbours above which a sample is a spike."""
 FEW_SPIKES = 1e-3
 """Share of samples that may be spikes; more are a property of the sensor."""
+ALIKE = -0.35
+"""Correlation of successive changes from which on samples are not those of white noise."""
+LEAST_MEANS = 1000
+"""Averages that tell that correlation."""
+STILL = 0.3
+"""Share of samples equal to the one before, above which the output's steps exceed its noise."""
 _NEIGHBOURS = 11
 _NORMAL = 0.6745
 """Median of the absolute value of a standard normal variable."""
@@ -98,6 +104,46 @@ def without_spikes(log: ImuLog) -> tuple[ImuLog, int]:
     return log._replace(
         valid=valid, gyro=np.where(keep, log.gyro, 0.0), accel=np.where(keep, log.accel, 0.0)
     ), count
+
+
+def unlike_neighbours(log: ImuLog) -> int:
+    """Return the shortest cluster that a filter in the sensor, or a held sample, hardly touches.
+
+    The changes of white noise have a correlation of -1/2 from one to the next, those of a sensor
+    that filters or holds its samples a larger one. Averages of a few samples have it again, and
+    clusters of eight times as many lose a few percent to the filter. One where samples are as they
+    should be, and where the record is too short for that.
+
+    Args:
+        log: A log on a regular grid.
+    """
+    values = np.where(log.valid[:, None], np.hstack([log.gyro, log.accel]), np.nan)
+    if max(map(_alike, values.T)) < ALIKE:
+        return 1
+    for size in (2, 4, 8, 16, 32, 64):
+        whole = len(values) // size
+        means = values[: whole * size].reshape(whole, size, 6).mean(axis=1)
+        if whole < LEAST_MEANS:
+            return 1
+        if max(map(_alike, means.T)) < ALIKE:
+            return 8 * size
+    return 1
+
+
+def _alike(axis: NDArray[np.float64]) -> float:
+    """Return the correlation of a change with the one before, -1/2 for white noise."""
+    change = np.diff(axis)
+    pair = np.isfinite(change[1:]) & np.isfinite(change[:-1])
+    one, other = change[:-1][pair], change[1:][pair]
+    power = float(one @ one)
+    return float(one @ other) / power if power > 0 else -0.5
+
+
+def coarse(log: ImuLog) -> list[str]:
+    """Return the axes whose output mostly stays what it was, a dead one not among them."""
+    values = np.hstack([log.gyro, log.accel])[log.valid]
+    still = np.mean(np.diff(values, axis=0) == 0, axis=0)
+    return [name for name, share in zip(SENSORS, still, strict=True) if STILL < share < 1]
 
 
 def quantum(axis: NDArray[np.float64]) -> float:

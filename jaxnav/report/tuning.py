@@ -47,7 +47,7 @@ def print_parameters(parameters: Mapping[str, Any]) -> None:
     """Print what can be tuned: by name, where it starts, its domain and what it is."""
     table = Table(title="parameters that can be tuned: --params NAME --start NAME=VALUE")
     for heading in ("parameter", "start", "domain", "what it is"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading, overflow="fold", no_wrap=heading == "parameter")
     for name, parameter in parameters.items():
         start = values_text(parameter.start)
         table.add_row(name, start, parameter.transform.domain, escape(parameter.text))

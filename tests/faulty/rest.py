@@ -83,6 +83,25 @@ def _dead(rng: np.random.Generator, time: np.ndarray, values: np.ndarray) -> Row
     return time, values * [1, 0, 1, 1, 1, 1]
 
 
+def _filtered(rng: np.random.Generator, time: np.ndarray, values: np.ndarray) -> Rows:
+    """Average each sample with the two before, as the filter of a sensor does."""
+    del rng
+    return time[2:], (values[2:] + values[1:-1] + values[:-2]) / 3
+
+
+def _held(rng: np.random.Generator, time: np.ndarray, values: np.ndarray) -> Rows:
+    """Give each sample four times, with noise of a quarter of the density then."""
+    del rng
+    held = np.repeat(values[::4], 4, axis=0)[: len(time)]
+    return time, MEAN + (held - MEAN) / 2
+
+
+def _coarse(rng: np.random.Generator, time: np.ndarray, values: np.ndarray) -> Rows:
+    del rng
+    step = 60 * WALK
+    return time, np.rint(values / step) * step
+
+
 FAULTS = {
     "none": Fault(lambda rng, time, values: (time, values)),
     "stamps of ten digits": Fault(
@@ -106,5 +125,8 @@ FAULTS = {
         refused="look like deg/s",
     ),
     "a gyro that swings": Fault(_swung, refused="gyro_z moves by"),
+    "a filter in the sensor": Fault(_filtered, noted="neighbouring samples are alike"),
+    "samples held four times": Fault(_held, noted="neighbouring samples are alike"),
+    "steps beyond the noise": Fault(_coarse, noted="most samples repeat the one before"),
     "a dead axis": Fault(_dead, noted="gyro_y: constant"),
 }

@@ -74,6 +74,10 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         filtered(filter=jn.kf(CURVED["transition"])),
         r"^the derivative of the model's transition depends on the state; a linear filter needs",
     ),
+    "a rounded transition": (
+        filtered(filter=jn.kf(MODEL._replace(transition=lambda p, x, u: x + jnp.floor(x)))),
+        r"^the derivative of the model's transition depends on the state; a linear filter needs",
+    ),
     "a nonlinear observation": (
         filtered(filter=jn.square_root_kf(CURVED["observe"])),
         r"^the derivative of the model's observe depends on the state; .* the ekf takes all",
@@ -338,7 +342,7 @@ WORDS = {
     "run immae --nope 3": (
         "unrecognized options: --nope, 3; `jaxnav run immae --help` lists what is accepted"
     ),
-    "tune gnss-track": "log is not given; it must be the path of an RTKLIB .pos file",
+    "tune gnss-track": "log is not given; it must be the path of an RTKLIB .pos file, by --log, or by --study.log where it is tuned",
 }
 
 

@@ -7,7 +7,8 @@ its own derivative (:func:`with_itself_as_jacobians`): its maps do not depend on
 ``vmap`` over runs shares what they make.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -72,8 +73,8 @@ def with_itself_as_jacobians(model: Model) -> Model:
                 if not is_affine(lambda x: function(params, x, u), x):
                     raise ValueError(
                         f"the derivative of the model's {name} depends on the state; a linear "
-                        "filter needs one that does not, the ekf takes all (and so it does where a "
-                        "loop of unknown length hides that it does not)"
+                        "filter needs one that does not and no rounding, the ekf takes all (and so "
+                        "it does where a loop of unknown length hides that it does not)"
                     )
                 return jax.jvp(lambda x: function(params, x, u), (x,), (dx,))[1]
 
@@ -89,7 +90,8 @@ def is_affine(function: Callable[[Array], Array], x: Array) -> bool:
 
     That is read off the operations and not off values: it costs tracing alone, holds under any
     transformation, and takes a derivative that depends on the point in form alone for one that
-    does, as that of a product with what turns out to be one, or of a ``while`` loop.
+    does, as that of a product with what turns out to be one, or of a ``while`` loop. An operation
+    whose derivative is zero by decree, as rounding, is none of an affine function.
 
     Args:
         function: Of a vector ``(n,)``.
@@ -98,7 +100,41 @@ def is_affine(function: Callable[[Array], Array], x: Array) -> bool:
     point = jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x))
     traced = jax.make_jaxpr(lambda x, dx: jax.jvp(function, (x,), (dx,))[1])(point, point).jaxpr
     _, used = partial_eval.dce_jaxpr(traced, [True] * len(traced.outvars))
-    return not used[0]
+    return not used[0] and not _steps(jax.make_jaxpr(function)(point).jaxpr)
+
+
+_ZERO_DERIVATIVE = {"round", "floor", "ceil", "sign", "stop_gradient", "argmax", "argmin"}
+
+
+def _steps(traced: Any, given: Sequence[bool] | None = None) -> bool:
+    """Return whether what depends on the inputs goes through an operation of no derivative.
+
+    Args:
+        traced: A jaxpr.
+        given: Which of its inputs count; the default is all.
+    """
+    moving = {
+        var
+        for var, on in zip(traced.invars, given or [True] * len(traced.invars), strict=True)
+        if on
+    }
+    for step in traced.eqns:
+        # a literal cannot be hashed, and moves with nothing
+        inputs = [not hasattr(var, "val") and var in moving for var in step.invars]
+        if not any(inputs):
+            continue
+        if step.primitive.name in _ZERO_DERIVATIVE:
+            return True
+        for inner in jax.tree.leaves(
+            list(step.params.values()), is_leaf=lambda part: hasattr(part, "eqns")
+        ):
+            body = getattr(inner, "jaxpr", inner)
+            if hasattr(body, "eqns"):
+                same = len(body.invars) == len(inputs)
+                if _steps(body, inputs if same else None):
+                    return True
+        moving |= set(step.outvars)
+    return False
 
 
 def jacobians(model: Model, params: Params, x: Point, u: Input, n: int) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.datasets.base import DataError
+from jaxnav.datasets.plausible import check_fixes
 from jaxnav.datasets.rtklib import load_rtklib_pos
 from jaxnav.datasets.track import GnssTrack, gaps, intervals_s, thin
 from jaxnav.estimation.banks.mixture import BankParams, panel
@@ -36,6 +37,8 @@ BANKS: dict[str, WeightRule] = {
     "floor": chain(bayes(), floor()),
     "markov": chain(markov(), bayes()),
 }
+UNLIKE = 3.0
+"""Ratio of the log's standard deviation to the one that is used from which on it is told."""
 BLOCKS = 30
 """Stretches of equal length whose scatter gives the standard error of a time average."""
 
@@ -100,7 +103,12 @@ def load(config: GnssTrackConfig) -> GnssTrack:
             "log is not given; it must be the path of an RTKLIB .pos file, by --log, or by "
             "--study.log where it is tuned"
         )
-    return load_rtklib_pos(config.log)
+    track = load_rtklib_pos(config.log)
+    try:
+        check_fixes(track.time_ns, track.geodetic, track.velocity, track.position_sigma)
+    except DataError as error:
+        raise DataError(f"{track.source}: {error}") from None
+    return track
 
 
 def track_data(config: GnssTrackConfig, track: GnssTrack) -> TrackData:
@@ -305,6 +313,12 @@ def _notes(config: GnssTrackConfig, track: GnssTrack, data: TrackData) -> list[s
         notes.append(
             f"{coarse} of {track.quality.size} fixes are not RTK-fixed (Q is not 1) and are used "
             f"with the same sigma of {config.position_sigma:g} m."
+        )
+    stated = np.nan if track.position_sigma is None else np.median(track.position_sigma[:, :2])
+    if stated > 0 and not 1 / UNLIKE < stated / config.position_sigma < UNLIKE:
+        notes.append(
+            f"The log states a standard deviation of {stated:.3g} m and the filters believe "
+            f"{config.position_sigma:g} m, which is --position-sigma."
         )
     if data.velocity is None:
         notes.append("The log has no velocity: the estimates are not scored against one.")
