@@ -342,7 +342,10 @@ WORDS = {
     "run immae --nope 3": (
         "unrecognized options: --nope, 3; `jaxnav run immae --help` lists what is accepted"
     ),
-    "tune gnss-track": "log is not given; it must be the path of an RTKLIB .pos file, by --log, or by --study.log where it is tuned",
+    "tune gnss-track": (
+        "log is not given; it must be the path of an RTKLIB .pos file, by --log, or by --study.log "
+        "where it is tuned"
+    ),
 }
 
 
