@@ -54,7 +54,20 @@ def test_rounding_and_drift_make_no_gap() -> None:
         assert (gaps, told) == (0, True)
 
 
-def test_loss_among_jitter_is_said_not_to_be_told() -> None:
+@pytest.mark.parametrize("share", [0.02, 0.1, 1 / 3, 0.5])
+def test_samples_lost_among_rounded_stamps_are_counted(share: float) -> None:
+    """A sensor of 400 Hz with stamps in whole milliseconds; a clock that drifts besides."""
+    rng = np.random.default_rng(4)
+    kept = INDEX[rng.random(COUNT) >= share]
+    drifting = kept * (1 + 1e-5 * kept / COUNT)
+    step, _, missing, told = between(np.rint(drifting * 2.5) / 2.5)
+    assert step == pytest.approx(1, abs=1e-4)
+    assert missing == kept[-1] - kept[0] + 1 - len(kept)
+    assert told
+
+
+@pytest.mark.parametrize("share", [0.1, 1 / 3, 0.5, 0.6])
+def test_loss_among_jitter_is_said_not_to_be_told(share: float) -> None:
     rng = np.random.default_rng(3)
-    kept = INDEX[rng.random(COUNT) > 1 / 3]
+    kept = INDEX[rng.random(COUNT) > share]
     assert not between(kept + 0.2 * rng.normal(size=len(kept)))[3]

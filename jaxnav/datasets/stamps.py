@@ -14,9 +14,12 @@ _WINDOW = 32
 """Samples on either side of a long interval over which jitter is averaged."""
 _SURE = 3.0
 """Sampling intervals above which jitter does not explain an interval."""
-_FEW = 0.02
-"""Share of intervals that are long without as many short ones, up to which gaps can be told from
-jitter."""
+_PAIRED = -0.35
+"""Correlation of successive intervals, -1/2 for jitter alone, below which gaps are told from it."""
+_STRETCH = 4096
+"""Stamps of which the phase on a grid is one."""
+_COHERENT = 0.6
+"""Least coherence on a grid, that of stamps off by a sixth of its step."""
 
 
 class Steps(NamedTuple):
@@ -41,8 +44,11 @@ def steps_between(intervals: NDArray[np.int64]) -> Steps:
       one: every third sample may be lost.
     * An interval is rounded, up to one and a half to one. So neither rounded stamps nor the drift
       of a clock loses a sample.
-    * Where stamps jitter by much, a long interval is followed or led by a short one. There a long
-      interval is a gap only by as much as the samples after it are late against those before.
+    * Stamps that are off by up to a third of that, as rounded ones may be, are counted on the
+      regular grid that they are closest to.
+    * Where they jitter by more, a long interval is followed or led by a short one, and is a gap
+      only by as much as the samples after it are late against those before. With many missing
+      besides, gaps are not told from jitter.
 
     Args:
         intervals: ``(N - 1,)``, positive, in any unit.
@@ -55,11 +61,15 @@ def steps_between(intervals: NDArray[np.int64]) -> Steps:
     whole = float(np.mean(intervals[count == 1]))
     if len(intervals) < 4 * _WINDOW or np.mean(_off(intervals / whole) < _NEAR) > _MOST:
         return Steps(count, whole)
+    regular = _on_grid(intervals, float(np.mean(intervals[intervals < GAP * unit])))
+    if regular is not None:
+        return regular
     late = np.cumsum(intervals)
     whole = float(np.median(late[_WINDOW:] - late[:-_WINDOW])) / _WINDOW
-    count = _averaged(intervals, whole)
-    unmatched = np.mean(intervals > GAP * whole) - np.mean(intervals < (2 - GAP) * whole)
-    return Steps(count, whole, told=bool(unmatched <= _FEW))
+    # the jitter of a stamp makes one interval longer and the next shorter, a loss makes one longer
+    moved = intervals[intervals < _SURE * whole] - whole
+    told = float(moved[1:] @ moved[:-1]) < _PAIRED * float(moved @ moved)
+    return Steps(_averaged(intervals, whole), whole, told)
 
 
 def _shortest(intervals: NDArray[np.int64]) -> float:
@@ -96,3 +106,46 @@ def _averaged(intervals: NDArray[np.int64], step: float) -> NDArray[np.int64]:
         best = np.argmax(np.where(group == own, jump, 0.0))
         plain[last[best]] += int(np.rint(jump[best]))
     return plain
+
+
+def _on_grid(intervals: NDArray[np.int64], near: float) -> Steps | None:
+    """Return the count on the regular grid that stamps are closest to, or ``None`` if to none.
+
+    The interval is refined over ever more stamps, since over many a small error of it adds up; the
+    phase is taken anew every :data:`_STRETCH` stamps, so that a clock may drift.
+
+    Args:
+        intervals: ``(N - 1,)``.
+        near: A sampling interval that is right to a tenth.
+    """
+    late = np.concatenate([[0.0], np.cumsum(intervals)])
+    step, width = near, 0.1
+    length = 32
+    while True:
+        part = late[: min(length, len(late))]
+        resolved = 0.1 * step / (part[-1] - part[0])
+        trials = step * (1 + np.arange(-width, width + resolved, resolved))
+        step = float(trials[np.argmax([_coherence(part, trial) for trial in trials])])
+        if length >= min(_STRETCH, len(late)):
+            break
+        width, length = 2 * resolved, 4 * length
+    index, shift = np.empty(len(late)), 0.0
+    for begin in range(0, len(late), _STRETCH):
+        part = late[begin : begin + _STRETCH] / step
+        turn = np.exp(2j * np.pi * part)
+        if abs(turn.mean()) < _COHERENT:
+            return None
+        phase = np.angle(turn.mean()) / (2 * np.pi)
+        # the phase of this stretch is that of the one before, but for what the clock drifted
+        phase += np.rint(shift - phase)
+        shift = phase
+        index[begin : begin + _STRETCH] = np.rint(part - phase)
+    count = np.diff(index).astype(np.int64)
+    if count.min() < 1:
+        return None
+    return Steps(count, float(late[-1] / count.sum()))
+
+
+def _coherence(late: NDArray[np.float64], step: float) -> float:
+    """Return how well stamps keep to a grid of a step, 1 at best."""
+    return abs(np.exp(2j * np.pi * late / step).mean())

@@ -26,6 +26,7 @@ LEAST_MEANS = 1000
 STILL = 0.3
 """Share of samples equal to the one before, above which the output's steps exceed its noise."""
 _NEIGHBOURS = 11
+_ALONE = 3
 _NORMAL = 0.6745
 """Median of the absolute value of a standard normal variable."""
 
@@ -83,7 +84,8 @@ def without_spikes(log: ImuLog) -> tuple[ImuLog, int]:
     """Return the log with spikes as lost samples, and their number.
 
     A spike is more than :data:`SPIKE` standard deviations off the median of the eleven samples
-    about it. Where more than :data:`FEW_SPIKES` of the samples are, none is taken out.
+    about it. Where more than :data:`FEW_SPIKES` of the samples are, none is taken out, nor where
+    they crowd: that is a bump, which a reader should see.
 
     Args:
         log: A log on a regular grid.
@@ -95,6 +97,8 @@ def without_spikes(log: ImuLog) -> tuple[ImuLog, int]:
         # of a coarse sensor more than half may be zero, and all but a few
         scale = max(np.median(off) / _NORMAL, np.percentile(off, 99) / 2.576, quantum(axis))
         spike |= off > SPIKE * scale
+    crowd = np.convolve(spike, np.ones(2 * _NEIGHBOURS - 1), "same")
+    spike &= crowd <= _ALONE
     count = int(np.sum(spike))
     if count == 0 or count > FEW_SPIKES * len(values):
         return log, 0
