@@ -135,7 +135,9 @@ def test_a_drive_is_tuned_from_its_configuration_file(tmp_path: Path) -> None:
 
 def test_what_is_neither_study_nor_log(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tune", "no-such-thing"]) == BAD_INPUT
-    assert "no study or log 'no-such-thing'; it must be a recorded" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no study or log 'no-such-thing'; it must be one of immae" in said
+    assert said.endswith("or a recorded drive\n")
     assert main(["tune"]) == BAD_INPUT
     assert main(["tune", "gnss-track"]) == BAD_INPUT
     assert "log is not given" in capsys.readouterr().err
