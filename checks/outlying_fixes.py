@@ -72,8 +72,9 @@ def main() -> int:
     from jaxnav.recorded.analysis import analyse
     from jaxnav.recorded.config import FilterConfig, FilterName
 
-    known = get_args(FilterName)
-    folder, *names = sys.argv[1:] or [""]
+    known: tuple[Any, ...] = get_args(FilterName)
+    folder = next(iter(sys.argv[1:]), "")
+    names: list[Any] = sys.argv[2:]
     if not folder or set(names) - set(known):
         print(f"usage: python checks/outlying_fixes.py FOLDER [{'|'.join(known)} ...]")
         return 2

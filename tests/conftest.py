@@ -28,8 +28,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Two workers that write one entry at once read halves of it.
     """
-    if hasattr(config, "workerinput"):
-        os.environ["XDG_CACHE_HOME"] += f"/{config.workerinput['workerid']}"
+    worker = getattr(config, "workerinput", None)
+    if worker is not None:
+        os.environ["XDG_CACHE_HOME"] += f"/{worker['workerid']}"
     else:
         folder = tempfile.mkdtemp(prefix="jaxnav-tests-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))

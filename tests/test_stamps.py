@@ -14,8 +14,8 @@ INDEX = np.arange(COUNT)
 def between(stamps: np.ndarray) -> tuple[float, int, int, bool]:
     """Step [sampling intervals], gaps, missing samples, and whether gaps could be told."""
     found = steps_between(np.diff(np.rint(np.sort(stamps) * STEP).astype(np.int64)))
-    assert found.count.min() >= 1
-    gaps, missing = int(np.sum(found.count > 1)), int(np.sum(found.count - 1))
+    assert found.between.min() >= 1
+    gaps, missing = int(np.sum(found.between > 1)), int(np.sum(found.between - 1))
     return found.step / STEP, gaps, missing, found.told
 
 

@@ -26,13 +26,13 @@ class Steps(NamedTuple):
     """How many sampling intervals lie between N stamps.
 
     Attributes:
-        count: ``(N - 1,)``, one or more; one where nothing is missing.
+        between: ``(N - 1,)``, one or more; one where nothing is missing.
         step: Sampling interval, the mean of those that are one: stamps in whole milliseconds have a
             median interval that is wrong by percents.
         told: Whether gaps could be told from jitter.
     """
 
-    count: NDArray[np.int64]
+    between: NDArray[np.int64]
     step: float
     told: bool = True
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.core import Tracer
 from jax.experimental import checkify
 
 from jaxnav.compiling import compiled
@@ -87,7 +88,7 @@ def _checked(filter: Filter, record: Recorder | None, every: int, segment: int) 
 
 
 def _debugged(scan: Any, given: tuple[Any, Input, Obs]) -> Trace:
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given)):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
         raise ValueError("debug is True within a transformation of JAX; it must be run outside")
     error, trace = scan(*given)
     said = error.get()

@@ -283,7 +283,7 @@ def test_a_roll_at_a_moving_start_is_no_drift() -> None:
         out[:, 1] = cosine * v[:, 1] + sine * v[:, 2]
         out[:, 2] = -sine * v[:, 1] + cosine * v[:, 2]
     leant[0][:, 0] += np.gradient(lean, time)
-    rolled = Sensed(time, *leant, cut.fix_time - begin, *cut[4:])
+    rolled = cut._replace(time=time, gyro=leant[0], accel=leant[1], fix_time=cut.fix_time - begin)
     found = outcome(truth, rolled)
     heading = heading_error(
         truth, found.report.drive.time + begin, np.asarray(found.report.kept.mean.dcm)
