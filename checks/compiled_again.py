@@ -4,8 +4,7 @@ Usage: python -m checks.compiled_again
 
 ``arekf --scenario outliers`` and ``mmae-ukf --scenario large-misalignment`` run with four runs, and
 then with 150 runs and another seed. Writes ``compiled_again.json`` beside this script: programs
-compiled and seconds of either; the exit code is 1 if any was compiled the second time. Takes eight
-minutes on two cores.
+compiled and seconds of either; the exit code is 1 if any was compiled the second time.
 """
 
 import json

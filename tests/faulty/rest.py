@@ -19,11 +19,15 @@ Rows = tuple[np.ndarray, np.ndarray]
 
 
 class Fault(NamedTuple):
-    """What is done to a clean log, and what must be said: a refusal, a note, or neither."""
+    """What is done to a clean log, and what must be said: a refusal, a note, or neither.
+
+    ``sensor`` is whether the numbers are then those of the sensor, and not of its output alone.
+    """
 
     spoil: Callable[[np.random.Generator, np.ndarray, np.ndarray], Rows]
     refused: str | None = None
     noted: str | None = None
+    sensor: bool = True
 
 
 def clean(rng: np.random.Generator, count: int) -> Rows:
@@ -127,6 +131,8 @@ FAULTS = {
     "a gyro that swings": Fault(_swung, refused="gyro_z moves by"),
     "a filter in the sensor": Fault(_filtered, noted="neighbouring samples are alike"),
     "samples held four times": Fault(_held, noted="neighbouring samples are alike"),
-    "steps beyond the noise": Fault(_coarse, noted="most samples repeat the one before"),
+    "steps beyond the noise": Fault(
+        _coarse, noted="most samples repeat the one before", sensor=False
+    ),
     "a dead axis": Fault(_dead, noted="gyro_y: constant"),
 }
