@@ -14,7 +14,8 @@ from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, Model, SureObs
-from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsParams, sins_cns
+from jaxnav.navigation.models.sins_cns import SinsCnsParams, sins_cns
+from jaxnav.navigation.states import LAYOUT
 
 
 class Statistics(NamedTuple):

@@ -14,7 +14,8 @@ from jax import Array
 
 from jaxnav.estimation.banks.mixture import BankParams
 from jaxnav.estimation.types import FilterParams, Gaussian, replicate
-from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsInput, SinsCnsParams
+from jaxnav.navigation.models.sins_cns import SinsCnsInput, SinsCnsParams
+from jaxnav.navigation.states import LAYOUT
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.simulation import build_world, fly_linear, noise_of, prior_sigma

@@ -49,7 +49,8 @@ from jaxnav.estimation.filters.square_root import square_root_ekf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs, replicate
-from jaxnav.navigation.models.sins_total import local, sins_total
+from jaxnav.navigation.models.sins_total import sins_total
+from jaxnav.navigation.states import local_total
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
 from jaxnav.studies.mmae_ukf.methods import model_factors
 from jaxnav.studies.mmae_ukf.simulation import (
@@ -314,7 +315,7 @@ class Alike:
         tolerance = common.TOLERANCE if rule in self.known else FIRST_ORDER
         steps = answer[1].shape[1]
         means, log_likelihood = jax.tree.map(lambda leaf: leaf[:, :steps], nearest)
-        apart = jax.vmap(jax.vmap(local))(means, answer[0]) / self.sigma
+        apart = jax.vmap(jax.vmap(local_total))(means, answer[0]) / self.sigma
         error = max(
             float(jnp.max(jnp.abs(apart))),
             float(np.max(np.abs(answer[1] - log_likelihood)) / np.max(np.abs(log_likelihood))),

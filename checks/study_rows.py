@@ -6,7 +6,8 @@ Every study on record is run with few runs and seed 0; what it keeps of each run
 ``study_rows.json`` beside this script: 1e-9 relative to the largest entry of the array along the
 runs. What differs by more is printed, with the run, and the exit code is 1. ``--record DIR`` takes
 the rows from results that ``jaxnav run --out`` has left in DIR/STUDY, one folder a scenario, and
-writes the file. Takes a quarter of an hour on two cores.
+puts them in the file in place of those of the same studies. Takes a quarter of an hour on two
+cores.
 """
 
 import argparse
@@ -94,7 +95,8 @@ def main() -> int:
     if unknown:
         parser.error(f"there is no study {unknown[0]!r}; it must be one of {', '.join(KEPT)}")
     if args.record is not None:
-        RECORD.write_text(json.dumps(recorded(args.record)) + "\n")
+        before = json.loads(RECORD.read_text()) if RECORD.exists() else {}
+        RECORD.write_text(json.dumps(before | recorded(args.record)) + "\n")
         return 0
     expected = json.loads(RECORD.read_text())
     missing = [name for name in args.studies if name not in expected]

@@ -13,7 +13,6 @@ from jaxnav.navigation.alignment import (
     static_biases,
 )
 from jaxnav.navigation.earth import FLAT, WGS84, offset_between
-from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
 from jaxnav.navigation.sensors.gnss import (
     GnssErrors,
@@ -22,6 +21,7 @@ from jaxnav.navigation.sensors.gnss import (
     observe_gnss,
     outages,
 )
+from jaxnav.navigation.states import SinsLevel
 from jaxnav.units import DEG, DEG_PER_HOUR
 from tests.oracles import rotations
 

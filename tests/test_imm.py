@@ -18,13 +18,8 @@ from jaxnav.estimation.filters.kalman import ekf, kf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Model, Obs, replicate
-from jaxnav.navigation.models.sins_total import (
-    SinsTotal,
-    SinsTotalInput,
-    SinsTotalParams,
-    retract,
-    sins_total,
-)
+from jaxnav.navigation.models.sins_total import SinsTotalInput, SinsTotalParams, sins_total
+from jaxnav.navigation.states import SinsTotal, retract_total
 from jaxnav.numerics.lie import dcm_from_euler
 from jaxnav.units import ARCSEC, DEG, DEG_PER_HOUR, MICRO_G
 
@@ -223,7 +218,7 @@ def navigation(count: int) -> tuple[FilterParams, SinsTotalInput, Obs]:
         jnp.zeros(3),
     )
     rng = np.random.default_rng(3)
-    start = retract(truth, sigma * jnp.array(rng.normal(size=15)))
+    start = retract_total(truth, sigma * jnp.array(rng.normal(size=15)))
     noise = SinsTotalParams(
         jnp.full(3, 0.05 * DEG_PER_HOUR),
         jnp.full(3, 10 * MICRO_G),

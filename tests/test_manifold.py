@@ -19,14 +19,12 @@ from jaxnav.estimation.filters.square_root import square_root_ekf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Obs
 from jaxnav.navigation.models.sins_total import (
-    SinsTotal,
     SinsTotalInput,
     SinsTotalParams,
     StarForm,
-    local,
-    retract,
     sins_total,
 )
+from jaxnav.navigation.states import SinsTotal, local_total, retract_total
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.strapdown.launch_inertial import mechanise_launch_inertial
@@ -106,9 +104,9 @@ def test_retract_and_local_are_inverse() -> None:
     dx = rng.normal(size=(64, 15)) * np.repeat([1.0, 1e3, 1e5, 1e-2, 0.1], 3)
     dx[:, :3] *= rng.uniform(0, 3, (64, 1)) / np.linalg.norm(dx[:, :3], axis=1, keepdims=True)
     dx[0] = 0
-    moved = jax.vmap(retract)(state, jnp.array(dx))
+    moved = jax.vmap(retract_total)(state, jnp.array(dx))
     scale = np.maximum(np.abs(dx).max(axis=0), 1)
-    back = np.asarray(jax.vmap(local)(state, moved))
+    back = np.asarray(jax.vmap(local_total)(state, moved))
     np.testing.assert_allclose(back / scale, dx / scale, rtol=0, atol=1e-13)
     for C, C0, phi in zip(moved.dcm, state.dcm, dx[:, :3], strict=True):
         np.testing.assert_allclose(C, rotations.exp(phi) @ C0, rtol=0, atol=1e-13)
@@ -177,7 +175,7 @@ def filtered(filter: Filter, star: StarForm, rule: SigmaRule | tuple[()] = ()) -
     truth = flight()
     rng = np.random.default_rng(3)
     first = jax.tree.map(lambda leaf: leaf[3000], truth.state)
-    start = retract(without_errors(first), jnp.array(SIGMA * rng.normal(size=15)))
+    start = retract_total(without_errors(first), jnp.array(SIGMA * rng.normal(size=15)))
     u = jax.tree.map(lambda leaf: leaf[600:640], increments(1200))
     C = truth.state.dcm[3005:3205:5]
     noisy = jax.vmap(lambda C, e: so3_exp(e) @ C)(
@@ -211,7 +209,7 @@ def test_filters_agree_at_errors_of_arc_seconds(star: StarForm) -> None:
     sigma = np.sqrt(np.diagonal(reference.cov, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None]
     for other in others:
-        apart = np.asarray(jax.vmap(local)(reference.mean, other.mean))
+        apart = np.asarray(jax.vmap(local_total)(reference.mean, other.mean))
         assert np.abs(apart[:, :3]).max() < 1e-3 * ARCSEC
         assert np.abs(apart / sigma).max() < 1e-4
         np.testing.assert_allclose((other.cov - reference.cov) / scale, 0, atol=1e-4)
@@ -243,9 +241,13 @@ def test_residual_of_rotation_vectors_near_and_at_half_a_turn() -> None:
 
 
 CENTRE, _ = random_states(np.random.default_rng(4), 1)
-turned = compiled(jax.vmap(lambda dx: retract(jax.tree.map(lambda leaf: leaf[0], CENTRE), dx)))
-match = compiled(lambda log_weights, members: moment_match(log_weights, members, retract, local))
-between = compiled(local)
+turned = compiled(
+    jax.vmap(lambda dx: retract_total(jax.tree.map(lambda leaf: leaf[0], CENTRE), dx))
+)
+match = compiled(
+    lambda log_weights, members: moment_match(log_weights, members, retract_total, local_total)
+)
+between = compiled(local_total)
 
 
 def matched(weights: list[float], turns: list[np.ndarray]) -> tuple[SinsTotal, Gaussian]:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from jaxnav.compiling import compiled
-from jaxnav.navigation.models.sins_cns import LAYOUT
-from jaxnav.navigation.models.sins_total import local
+from jaxnav.navigation.states import LAYOUT, local_total
 from jaxnav.studies.attitude import AXES
 from jaxnav.studies.base import ConfigError, StudyResult
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
@@ -86,7 +85,7 @@ def test_flights_start_with_errors_from_the_prior() -> None:
             still = jax.tree.map(lambda leaf: leaf[0], flight.truth)
             lift_off = jax.tree.map(lambda leaf: leaf[0], world.trajectory.state)
             true = still._replace(**lift_off._asdict())
-            return local(true, flight.start)
+            return local_total(true, flight.start)
 
         keys = jax.random.split(jax.random.key(3), 2000)
         errors = np.asarray(compiled(jax.vmap(start_error))(keys))

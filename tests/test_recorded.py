@@ -23,9 +23,9 @@ from jaxnav.datasets.inertial import assemble
 from jaxnav.datasets.track import GnssTrack
 from jaxnav.estimation.filters.linearise import jacobians
 from jaxnav.navigation.earth import displaced
-from jaxnav.navigation.models.level_errors import LevelError, SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, REST, VehicleInput, VehicleParams, vehicle
+from jaxnav.navigation.states import LevelError, SinsLevel
 from jaxnav.navigation.trajectory.vehicle import Leg, VehicleProfile, drive
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.options import parse_filter

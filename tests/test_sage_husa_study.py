@@ -11,7 +11,7 @@ from jaxnav.estimation.banks.mixture import moment_match
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.estimation.types import Gaussian
 from jaxnav.navigation.earth import displaced, offset_between
-from jaxnav.navigation.models.level_errors import SinsLevel, error_form
+from jaxnav.navigation.states import SinsLevel, error_form
 from jaxnav.studies.base import ConfigError
 from jaxnav.studies.sage_husa import study
 from jaxnav.studies.sage_husa.claims import NOISY, assess, change

@@ -7,14 +7,13 @@ from oracles import rotations, sins
 
 from jaxnav.compiling import compiled
 from jaxnav.navigation.models.sins_cns import (
-    ATTITUDE_LAYOUT,
-    LAYOUT,
     SinsCnsInput,
     SinsCnsParams,
     inputs_from_solution,
     sins_cns,
     sins_cns_attitude,
 )
+from jaxnav.navigation.states import ATTITUDE_LAYOUT, LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.launch_inertial import NavSolution
 from jaxnav.numerics.lie import so3_local

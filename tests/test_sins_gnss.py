@@ -14,8 +14,8 @@ from jaxnav.estimation.filters.linearise import jacobians
 from jaxnav.estimation.run import Trace, run
 from jaxnav.estimation.types import FilterParams, Flag, Gaussian, Obs, observed
 from jaxnav.navigation.earth import FLAT, WGS84, Earth
-from jaxnav.navigation.models.level_errors import LevelError, SinsLevel, error_form
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
+from jaxnav.navigation.states import LevelError, SinsLevel, error_form
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.units import DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, MICRO_G
 

@@ -16,7 +16,6 @@ from jaxnav.estimation.types import FilterParams, Flag, Gaussian, Model, Obs
 from jaxnav.navigation.atmosphere import RefractionTable, tabulate
 from jaxnav.navigation.earth import GM, MEAN_RADIUS
 from jaxnav.navigation.limb import fitted_model, seen_refraction
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_rkcns import (
     RayForm,
     SinsRkcnsInput,
@@ -24,7 +23,7 @@ from jaxnav.navigation.models.sins_rkcns import (
     observations,
     sins_rkcns,
 )
-from jaxnav.navigation.models.sins_total import SinsTotal, retract
+from jaxnav.navigation.states import LAYOUT, SinsTotal, retract_total
 from jaxnav.numerics.lie import dcm_from_euler, so3_exp
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 
@@ -145,7 +144,7 @@ def test_the_forms_have_the_same_slope_of_height_by_position() -> None:
         given = params(form)
 
         def channels(dr: Array) -> Array:
-            at = retract(x, jnp.zeros(15).at[LAYOUT.dr].set(dr))
+            at = retract_total(x, jnp.zeros(15).at[LAYOUT.dr].set(dr))
             return MODELS[form].observe(given, at, u)[3:6]
 
         return compiled(jax.jacfwd(channels))(jnp.zeros(3))

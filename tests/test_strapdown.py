@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 
 from jaxnav.compiling import compiled
-from jaxnav.navigation.models.sins_cns import (
-    LAYOUT,
-    SinsCnsParams,
-    inputs_from_solution,
-    sins_cns,
-)
+from jaxnav.navigation.models.sins_cns import SinsCnsParams, inputs_from_solution, sins_cns
+from jaxnav.navigation.states import LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import rotation_compensated
 from jaxnav.navigation.strapdown.launch_inertial import NavSolution, mechanise_launch_inertial

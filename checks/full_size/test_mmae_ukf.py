@@ -15,7 +15,7 @@ from jaxnav.estimation.metrics import chi2_mean_bounds, mean_interval, nees, rms
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs
-from jaxnav.navigation.models.sins_total import local
+from jaxnav.navigation.states import local_total
 from jaxnav.studies.base import StudyResult
 from jaxnav.studies.mmae_ukf.claims import assess, gain
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
@@ -145,7 +145,7 @@ def test_matched_filters_are_consistent_and_mistuned_ones_are_not(note: Note) ->
             )
             x, P = jax.tree.map(lambda leaf: leaf[epochs], trace.record)
             truth = jax.tree.map(lambda leaf: leaf[epochs], flight.truth)
-            return jax.vmap(nees)(jax.vmap(local)(truth, x), P)
+            return jax.vmap(nees)(jax.vmap(local_total)(truth, x), P)
 
         @compiled
         def over_runs(keys: jax.Array, share: jax.Array) -> jax.Array:

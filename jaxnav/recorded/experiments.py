@@ -19,8 +19,8 @@ from jaxnav.estimation.filters.sage_husa import sage_husa
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Obs, WeightRule, replicate
 from jaxnav.navigation.earth import WGS84, metres_per_radian
-from jaxnav.navigation.models.level_errors import SinsLevel, error_form
 from jaxnav.navigation.models.vehicle import FIXES, vehicle
+from jaxnav.navigation.states import SinsLevel, error_form
 from jaxnav.recorded.config import ALONE, FilterConfig
 from jaxnav.recorded.methods import Kept, Method, filter_params, sage_husa_params
 from jaxnav.recorded.preparation import Drive, prepare

@@ -38,9 +38,9 @@ from jaxnav.estimation.types import (
     WeightRule,
     replicate,
 )
-from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
+from jaxnav.navigation.states import ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.recorded.config import FilterConfig, members
 from jaxnav.recorded.preparation import CHANNELS, Drive
 from jaxnav.units import DEG, GRAVITY

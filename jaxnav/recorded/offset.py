@@ -13,8 +13,8 @@ from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Info, Obs
-from jaxnav.navigation.models.level_errors import error_form
 from jaxnav.navigation.models.vehicle import FIXES, vehicle
+from jaxnav.navigation.states import error_form
 from jaxnav.numerics.linalg import cholesky, solve_lower
 from jaxnav.recorded.config import ALONE, FilterConfig
 from jaxnav.recorded.methods import filter_params

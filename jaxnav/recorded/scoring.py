@@ -12,8 +12,8 @@ from jaxnav.compiling import compiled
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import displaced
-from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.vehicle import FIXES, VehicleInput, VehicleParams
+from jaxnav.navigation.states import SinsLevel
 from jaxnav.numerics.masks import runs_of
 from jaxnav.recorded.methods import Kept
 from jaxnav.recorded.motion import offsets, since_start

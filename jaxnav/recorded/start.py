@@ -14,7 +14,7 @@ from jaxnav.datasets.drive import DriveLog
 from jaxnav.datasets.track import GnssTrack
 from jaxnav.estimation.types import Gaussian
 from jaxnav.navigation.alignment import align_with_heading, course_heading
-from jaxnav.navigation.models.level_errors import SinsLevel
+from jaxnav.navigation.states import SinsLevel
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.numerics.linalg import matmul
 from jaxnav.numerics.masks import runs_of

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.types import Gaussian
-from jaxnav.navigation.models.level_errors import SinsLevel, error_form
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
+from jaxnav.navigation.states import LAYOUT, SinsLevel, error_form
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.trajectory.base import Trajectory
 

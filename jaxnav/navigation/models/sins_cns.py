@@ -26,27 +26,6 @@ from jaxnav.numerics.lie import skew
 from jaxnav.numerics.linalg import matmul
 
 
-class Layout(NamedTuple):
-    """Blocks of the error state."""
-
-    phi: slice = slice(0, 3)
-    dv: slice = slice(3, 6)
-    dr: slice = slice(6, 9)
-    eps: slice = slice(9, 12)
-    nabla: slice = slice(12, 15)
-
-
-class AttitudeLayout(NamedTuple):
-    """Blocks of the autonomous attitude part of the error state."""
-
-    phi: slice = slice(0, 3)
-    eps: slice = slice(3, 6)
-
-
-LAYOUT = Layout()
-ATTITUDE_LAYOUT = AttitudeLayout()
-
-
 class SinsCnsParams(NamedTuple):
     """Noise of the model.
 

@@ -2,7 +2,7 @@
 
 The state is the navigation solution itself, driven by inertial increments: attitude C_nb, velocity,
 geodetic position, gyro drift and accelerometer bias (measured minus true). How its error is
-defined is a choice (:mod:`~jaxnav.navigation.models.level_errors`), and with it one extended Kalman
+defined is a choice (:mod:`~jaxnav.navigation.states`), and with it one extended Kalman
 filter is the usual error-state filter, the left-invariant one or that on SE_2(3).
 
 References:
@@ -30,9 +30,8 @@ from jaxnav.navigation.earth import (
     offset_between,
     transport_rate,
 )
-from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.sensors.gnss import antenna_motion
+from jaxnav.navigation.states import LAYOUT, ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.local_level import level_step
 from jaxnav.numerics.lie import skew, so3_exp, so3_left_jacobian

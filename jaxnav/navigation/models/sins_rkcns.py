@@ -30,8 +30,7 @@ from jaxnav.estimation.types import Model, NonAdditive
 from jaxnav.navigation.atmosphere import RefractionTable
 from jaxnav.navigation.earth import gravity_launch_inertial
 from jaxnav.navigation.limb import HeightModel, model_height, ray_height, seen_refraction
-from jaxnav.navigation.models.sins_cns import LAYOUT
-from jaxnav.navigation.models.sins_total import SinsTotal, local, retract
+from jaxnav.navigation.states import LAYOUT, SinsTotal, local_total, retract_total
 from jaxnav.numerics.lie import so3_exp, so3_local, so3_log, so3_retract
 from jaxnav.numerics.linalg import matmul
 from jaxnav.numerics.ode import rk4
@@ -112,7 +111,7 @@ def sins_rkcns(period: float, imu_step: float, radius: float, ray: RayForm = "he
 
     Returns:
         A model with :class:`SinsRkcnsParams` and :class:`SinsRkcnsInput` on the manifold of
-        :class:`~jaxnav.navigation.models.sins_total.SinsTotal`, ``6 + n`` channels.
+        :class:`~jaxnav.navigation.states.SinsTotal`, ``6 + n`` channels.
 
     Raises:
         ValueError: If ``ray`` is neither.
@@ -170,8 +169,8 @@ def sins_rkcns(period: float, imu_step: float, radius: float, ray: RayForm = "he
         observe,
         observation_noise,
         _residual,
-        retract,
-        local,
+        retract_total,
+        local_total,
         noisy=NonAdditive(disturbed, sources),
     )
 

@@ -3,7 +3,7 @@
 The state is the navigation solution itself, driven by the increments of the inertial sensors:
 attitude C_ib, velocity, position, gyro drift eps and accelerometer error nabla (body axes, measured
 minus true), the last a first-order Markov process. Its tangent space has fifteen coordinates in the
-blocks of :data:`~jaxnav.navigation.models.sins_cns.LAYOUT`; the attitude's is the small rotation
+blocks of :data:`~jaxnav.navigation.states.LAYOUT`; the attitude's is the small rotation
 phi in inertial axes with ``C_computed = exp([phi]x) C_true``.
 
 References:
@@ -19,7 +19,7 @@ from jax import Array
 
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import gravity_gradient_launch_inertial, gravity_launch_inertial
-from jaxnav.navigation.models.sins_cns import LAYOUT
+from jaxnav.navigation.states import LAYOUT, SinsTotal, local_total, retract_total
 from jaxnav.numerics.lie import (
     euler_error_from_rotation,
     euler_from_dcm,
@@ -27,30 +27,11 @@ from jaxnav.numerics.lie import (
     so3_left_jacobian,
     so3_local,
     so3_log,
-    so3_retract,
     wrapped_angle,
 )
 from jaxnav.numerics.linalg import matmul
 
 StarForm = Literal["rotation-vector", "euler"]
-
-
-class SinsTotal(NamedTuple):
-    """A point of the state's manifold.
-
-    Attributes:
-        dcm: C_ib ``(3, 3)``.
-        velocity: ``(3,) [m/s]``.
-        position: ``(3,) [m]`` from the launch point.
-        drift: Gyro drift ``(3,) [rad/s]``.
-        bias: Accelerometer error ``(3,) [m/s^2]``.
-    """
-
-    dcm: Array
-    velocity: Array
-    position: Array
-    drift: Array
-    bias: Array
 
 
 class SinsTotalParams(NamedTuple):
@@ -84,31 +65,6 @@ class SinsTotalInput(NamedTuple):
     dtheta: Array
     dvel: Array
     true_scale: Array
-
-
-def retract(x: SinsTotal, dx: Array) -> SinsTotal:
-    """Return the state displaced by a tangent vector ``(15,)``."""
-    s = LAYOUT
-    return SinsTotal(
-        dcm=so3_retract(x.dcm, dx[s.phi]),
-        velocity=x.velocity + dx[s.dv],
-        position=x.position + dx[s.dr],
-        drift=x.drift + dx[s.eps],
-        bias=x.bias + dx[s.nabla],
-    )
-
-
-def local(x: SinsTotal, y: SinsTotal) -> Array:
-    """Return the tangent vector ``(15,)`` from ``x`` to ``y``."""
-    return jnp.concatenate(
-        [
-            so3_local(x.dcm, y.dcm),
-            y.velocity - x.velocity,
-            y.position - x.position,
-            y.drift - x.drift,
-            y.bias - x.bias,
-        ]
-    )
 
 
 def sins_total(
@@ -172,7 +128,9 @@ def sins_total(
     ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
         return _transition_differential(period, radius, params, x, u), observed(x)
 
-    return Model(transition, process_noise, observe, noise, residual, retract, local, jacobians)
+    return Model(
+        transition, process_noise, observe, noise, residual, retract_total, local_total, jacobians
+    )
 
 
 def _felt(period: float, x: SinsTotal, u: SinsTotalInput) -> Array:

@@ -17,14 +17,13 @@ from jax import Array
 
 from jaxnav.estimation.types import Model, seeing
 from jaxnav.navigation.earth import WGS84, Earth, displaced, earth_rate, offset_between
-from jaxnav.navigation.models.level_errors import LevelError, SinsLevel, error_form
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import (
     CHANNELS,
     SinsGnssInput,
     SinsGnssParams,
     sins_gnss,
 )
+from jaxnav.navigation.states import LAYOUT, LevelError, SinsLevel, error_form
 from jaxnav.navigation.strapdown.local_level import pull
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.numerics.linalg import matmul

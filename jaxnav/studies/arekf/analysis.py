@@ -12,9 +12,8 @@ from jaxnav.compiling import compiled
 from jaxnav.estimation.mismatch import Mismatch, MismatchState, mismatched
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, SureObs
-from jaxnav.navigation.models.level_errors import SinsLevel
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
+from jaxnav.navigation.states import LAYOUT, SinsLevel
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.studies.arekf.config import BIASED, NOISY, ArekfConfig
 from jaxnav.studies.arekf.simulation import build_world, noise_of, prior_sigma

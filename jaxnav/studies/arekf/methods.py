@@ -19,9 +19,8 @@ from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.montecarlo import RunOutput
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, replicate
-from jaxnav.navigation.models.level_errors import ErrorForm, LevelError, SinsLevel, error_form
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams, sins_gnss
+from jaxnav.navigation.states import LAYOUT, ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.trajectory.arc import ArcProfile
 from jaxnav.studies.arekf.config import ArekfConfig
 from jaxnav.studies.arekf.simulation import Run, Timing, World, fly_run, timing_of

@@ -9,11 +9,11 @@ from jax import Array
 from jaxnav.compiling import host
 from jaxnav.estimation.types import Gaussian, Obs, SureObs
 from jaxnav.navigation.earth import earth_rate, normal_gravity
-from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.sensors.allan import allan_variance, cluster_sizes, slope_rule
 from jaxnav.navigation.sensors.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
+from jaxnav.navigation.states import SinsLevel
 from jaxnav.navigation.trajectory.arc import ArcProfile, fly_arc
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.studies.arekf.config import ArekfConfig, Sensor

@@ -16,9 +16,8 @@ from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import likelihood, rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE
 from jaxnav.estimation.types import FilterParams, Gaussian, Obs
-from jaxnav.navigation.models.level_errors import SinsLevel
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput
+from jaxnav.navigation.states import LAYOUT, SinsLevel
 from jaxnav.numerics.lie import so3_local
 from jaxnav.studies.arekf.config import DRIFTING, SCENARIOS, ArekfConfig
 from jaxnav.studies.arekf.methods import Shared, filters, shared_of

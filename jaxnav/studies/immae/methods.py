@@ -31,7 +31,8 @@ from jaxnav.estimation.types import (
     WeightRule,
     replicate,
 )
-from jaxnav.navigation.models.sins_cns import LAYOUT, SinsCnsInput, SinsCnsParams, sins_cns
+from jaxnav.navigation.models.sins_cns import SinsCnsInput, SinsCnsParams, sins_cns
+from jaxnav.navigation.states import LAYOUT
 from jaxnav.numerics.lie import so3_left_jacobian
 from jaxnav.studies.immae.config import ImmaeConfig
 from jaxnav.studies.immae.simulation import World, fly_linear, fly_sins, noise_of, prior_sigma

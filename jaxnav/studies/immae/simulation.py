@@ -10,7 +10,6 @@ from jaxnav.compiling import compiled, host
 from jaxnav.estimation.run import simulate
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_cns import (
-    LAYOUT,
     SinsCnsInput,
     SinsCnsParams,
     inputs_from_solution,
@@ -18,6 +17,7 @@ from jaxnav.navigation.models.sins_cns import (
 )
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
 from jaxnav.navigation.sensors.star import observe_attitude
+from jaxnav.navigation.states import LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import rotation_compensated
 from jaxnav.navigation.strapdown.launch_inertial import NavSolution, mechanise_launch_inertial

@@ -20,12 +20,8 @@ from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood, rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE, UNIT, above
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, WeightRule, replicate
-from jaxnav.navigation.models.sins_cns import (
-    ATTITUDE_LAYOUT,
-    LAYOUT,
-    SinsCnsInput,
-    sins_cns_attitude,
-)
+from jaxnav.navigation.models.sins_cns import SinsCnsInput, sins_cns_attitude
+from jaxnav.navigation.states import ATTITUDE_LAYOUT, LAYOUT
 from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.immae.config import SCENARIOS, ImmaeConfig
 from jaxnav.studies.immae.methods import (

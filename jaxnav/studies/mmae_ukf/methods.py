@@ -33,13 +33,8 @@ from jaxnav.estimation.types import (
     WeightRule,
     replicate,
 )
-from jaxnav.navigation.models.sins_cns import LAYOUT
-from jaxnav.navigation.models.sins_total import (
-    SinsTotal,
-    SinsTotalInput,
-    StarForm,
-    sins_total,
-)
+from jaxnav.navigation.models.sins_total import SinsTotalInput, StarForm, sins_total
+from jaxnav.navigation.states import LAYOUT, SinsTotal
 from jaxnav.numerics.lie import euler_from_dcm, so3_local, so3_retract, wrapped_angle
 from jaxnav.numerics.sequences import hammersley, log_grid
 from jaxnav.studies.attitude import DIVERGED_SIGMAS

@@ -8,16 +8,10 @@ from jax import Array
 
 from jaxnav.compiling import compiled, host
 from jaxnav.navigation.earth import meridian_radius
-from jaxnav.navigation.models.sins_cns import LAYOUT
-from jaxnav.navigation.models.sins_total import (
-    SinsTotal,
-    SinsTotalInput,
-    SinsTotalParams,
-    StarForm,
-    retract,
-)
+from jaxnav.navigation.models.sins_total import SinsTotalInput, SinsTotalParams, StarForm
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt, markov_error
 from jaxnav.navigation.sensors.star import observe_attitude
+from jaxnav.navigation.states import LAYOUT, SinsTotal, retract_total
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.trajectory.base import Trajectory
@@ -157,7 +151,7 @@ def fly(key: Array, world: World, period: float, imu_step: float, star: StarForm
     lift_off = SinsTotal(pad.dcm, pad.velocity, pad.position, jnp.zeros(3), jnp.zeros(3))
     at_epochs = jnp.concatenate([bias[every::every], bias[-1:]])
     return Run(
-        start=retract(lift_off, error0.at[LAYOUT.eps.start :].set(0)),
+        start=retract_total(lift_off, error0.at[LAYOUT.eps.start :].set(0)),
         inputs=SinsTotalInput(dtheta, dvel, world.step_scale),
         z=jax.vmap(report)(seen),
         truth=SinsTotal(*world.epochs, jnp.broadcast_to(drift, at_epochs.shape), at_epochs),

@@ -14,8 +14,8 @@ from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_total import StarForm
+from jaxnav.navigation.states import LAYOUT
 from jaxnav.numerics.lie import so3_local
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
 from jaxnav.studies.mmae_ukf.methods import Setup, model_of, setup_of, steps_outside

@@ -20,8 +20,8 @@ from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE, above
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, WeightRule, replicate
-from jaxnav.navigation.models.sins_cns import LAYOUT
-from jaxnav.navigation.models.sins_total import SinsTotal, SinsTotalInput
+from jaxnav.navigation.models.sins_total import SinsTotalInput
+from jaxnav.navigation.states import LAYOUT, SinsTotal
 from jaxnav.numerics.lie import so3_local
 from jaxnav.numerics.sigma import unscented
 from jaxnav.studies.base import require_one_scenario

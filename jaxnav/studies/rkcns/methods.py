@@ -21,9 +21,9 @@ from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Obs, SureObs
 from jaxnav.navigation.atmosphere import RefractionTable
 from jaxnav.navigation.earth import MEAN_RADIUS
 from jaxnav.navigation.limb import HeightModel, exponential_model, fitted_model
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsParams, sins_rkcns
-from jaxnav.navigation.models.sins_total import SinsTotal, local, sins_total
+from jaxnav.navigation.models.sins_total import sins_total
+from jaxnav.navigation.states import LAYOUT, SinsTotal, local_total
 from jaxnav.numerics.lie import euler_from_dcm, wrapped_angle
 from jaxnav.studies.rkcns.config import RkcnsConfig
 from jaxnav.studies.rkcns.simulation import Run, Timing, World, fly_run, noise_of, timing_of
@@ -200,7 +200,7 @@ def _record(filter: Filter, state: Any, info: Any) -> Gaussian:
 def _judge(truth: SinsTotal, estimates: Gaussian) -> tuple[Row, Any, Any]:
     """Compare estimates ``(K)`` with true states ``(K)``."""
     s = LAYOUT
-    error = jax.vmap(local)(truth, estimates.mean)
+    error = jax.vmap(local_total)(truth, estimates.mean)
     angles, true_angles = (jax.vmap(euler_from_dcm)(at.dcm) for at in (estimates.mean, truth))
     turned = wrapped_angle(angles, true_angles)[:, jnp.array([1, 0, 2])]
     consistency = jax.vmap(nees)(error, estimates.cov)

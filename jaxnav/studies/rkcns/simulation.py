@@ -15,19 +15,13 @@ from jaxnav.estimation.types import FilterParams, Gaussian, SureObs
 from jaxnav.navigation.atmosphere import RefractionTable, tabulate
 from jaxnav.navigation.earth import MEAN_RADIUS
 from jaxnav.navigation.limb import seen_refraction
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsInput, observations
-from jaxnav.navigation.models.sins_total import (
-    SinsTotal,
-    SinsTotalInput,
-    SinsTotalParams,
-    retract,
-    sins_total,
-)
+from jaxnav.navigation.models.sins_total import SinsTotalInput, SinsTotalParams, sins_total
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
 from jaxnav.navigation.sensors.refraction import Camera, measure, pick, view
 from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.stars import StarCatalogue, brighter, dcm_launch_icrs, directions
+from jaxnav.navigation.states import LAYOUT, SinsTotal, retract_total
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
@@ -300,7 +294,7 @@ def _dead_reckoned(
     pad = jax.tree.map(lambda leaf: leaf[0], world.trajectory.state)
     none = jnp.zeros(3, error0.dtype)
     at_rest = SinsTotal(pad.dcm, pad.velocity, pad.position, none, none)
-    believed = retract(at_rest, error0.at[LAYOUT.eps.start :].set(0))
+    believed = retract_total(at_rest, error0.at[LAYOUT.eps.start :].set(0))
     every = round(timing.launch_period / timing.imu_step)
     dtheta, dvel = accumulate(turns, gains, every)
     steps = dtheta.shape[0]

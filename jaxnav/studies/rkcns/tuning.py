@@ -15,8 +15,8 @@ from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE
 from jaxnav.estimation.types import FilterParams, Gaussian, Obs
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsInput
+from jaxnav.navigation.states import LAYOUT
 from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.rkcns.config import SCENARIOS, RkcnsConfig
 from jaxnav.studies.rkcns.methods import Setup, Shared, filters, problem_of, setup_of, shared_of

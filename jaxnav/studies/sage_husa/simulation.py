@@ -9,9 +9,9 @@ from jax import Array
 from jaxnav.compiling import host
 from jaxnav.estimation.types import Gaussian, Model, Obs, SureObs, seeing
 from jaxnav.navigation.earth import displaced
-from jaxnav.navigation.models.level_errors import SinsLevel
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.sensors.gnss import GnssErrors, observe_gnss
+from jaxnav.navigation.states import SinsLevel
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.vehicle import VehicleProfile, drive, town_legs
 from jaxnav.studies.level_sins import Clock, sense

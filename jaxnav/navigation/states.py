@@ -1,8 +1,9 @@
-"""Definitions of the error of a SINS in the local level frame: additive, and invariant on SE_2(3).
+"""States of a strapdown inertial system: layouts, nominal points and forms of their error.
 
-A tangent vector ``(15,)`` at a state has the blocks of
-:data:`~jaxnav.navigation.models.sins_cns.LAYOUT`; biases always add. What attitude, velocity and
-position are displaced by is the definition's:
+A tangent vector ``(15,)`` has the blocks of :data:`LAYOUT`, whichever the frame; biases always add.
+Of a :class:`SinsTotal`, in an inertial frame, attitude is displaced by ``exp([phi]x) C`` and all
+else adds. For a :class:`SinsLevel`, in the local level frame, what attitude, velocity and position
+are displaced by is the definition's:
 
 * additive: ``exp([phi]x) C``, ``v + dv``, ``p + dr``, resolved east, north, up;
 * left-invariant: ``X exp(xi)``, resolved in body axes;
@@ -25,7 +26,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.navigation.earth import WGS84, Earth, displaced, offset_between
-from jaxnav.navigation.models.sins_cns import LAYOUT
 from jaxnav.numerics.lie import so3_exp, so3_local, so3_log, so3_retract
 from jaxnav.numerics.linalg import matmul
 from jaxnav.numerics.se23 import ExtendedPose, se23_exp, se23_log
@@ -33,6 +33,70 @@ from jaxnav.numerics.se23 import ExtendedPose, se23_exp, se23_log
 LevelError = Literal["additive", "left-invariant", "right-invariant"]
 _POSE = slice(0, 9)
 _BIASES = slice(9, 15)
+
+
+class Layout(NamedTuple):
+    """Blocks of the error state."""
+
+    phi: slice = slice(0, 3)
+    dv: slice = slice(3, 6)
+    dr: slice = slice(6, 9)
+    eps: slice = slice(9, 12)
+    nabla: slice = slice(12, 15)
+
+
+class AttitudeLayout(NamedTuple):
+    """Blocks of the autonomous attitude part of the error state."""
+
+    phi: slice = slice(0, 3)
+    eps: slice = slice(3, 6)
+
+
+LAYOUT = Layout()
+ATTITUDE_LAYOUT = AttitudeLayout()
+
+
+class SinsTotal(NamedTuple):
+    """A point of the state's manifold.
+
+    Attributes:
+        dcm: C_ib ``(3, 3)``.
+        velocity: ``(3,) [m/s]``.
+        position: ``(3,) [m]`` from the launch point.
+        drift: Gyro drift ``(3,) [rad/s]``.
+        bias: Accelerometer error ``(3,) [m/s^2]``.
+    """
+
+    dcm: Array
+    velocity: Array
+    position: Array
+    drift: Array
+    bias: Array
+
+
+def retract_total(x: SinsTotal, dx: Array) -> SinsTotal:
+    """Return the state displaced by a tangent vector ``(15,)``."""
+    s = LAYOUT
+    return SinsTotal(
+        dcm=so3_retract(x.dcm, dx[s.phi]),
+        velocity=x.velocity + dx[s.dv],
+        position=x.position + dx[s.dr],
+        drift=x.drift + dx[s.eps],
+        bias=x.bias + dx[s.nabla],
+    )
+
+
+def local_total(x: SinsTotal, y: SinsTotal) -> Array:
+    """Return the tangent vector ``(15,)`` from ``x`` to ``y``."""
+    return jnp.concatenate(
+        [
+            so3_local(x.dcm, y.dcm),
+            y.velocity - x.velocity,
+            y.position - x.position,
+            y.drift - x.drift,
+            y.bias - x.bias,
+        ]
+    )
 
 
 class SinsLevel(NamedTuple):
