@@ -13,11 +13,11 @@ from jaxnav.estimation.mismatch import Mismatch, MismatchState, mismatched
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, SureObs
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
+from jaxnav.navigation.sense import true_states
 from jaxnav.navigation.states import LAYOUT, SinsLevel
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.studies.arekf.config import BIASED, NOISY, ArekfConfig
 from jaxnav.studies.arekf.simulation import build_world, noise_of, prior_sigma
-from jaxnav.studies.level_sins import true_states
 
 GRADES = {
     "noise-dominated": NOISY,
@@ -97,7 +97,7 @@ def _path(config: ArekfConfig) -> tuple[PathInput, Array]:
     motion, every = build_world(config).trajectory, config.samples_per_step
     dtheta, gain = compiled(accumulate, static_argnums=2)(motion.dtheta, motion.dvel, every)
     none = jnp.zeros(3)
-    states = true_states(motion, every, none, none)
+    states = true_states(SinsLevel, motion, every, none, none)
     before, after = (
         jax.tree.map(lambda leaf, at=at: leaf[at], states)
         for at in (slice(None, -1), slice(1, None))

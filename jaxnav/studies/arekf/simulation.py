@@ -10,6 +10,7 @@ from jaxnav.compiling import host
 from jaxnav.estimation.types import Gaussian, Obs, SureObs
 from jaxnav.navigation.earth import earth_rate, normal_gravity
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
+from jaxnav.navigation.sense import Clock, sense_level
 from jaxnav.navigation.sensors.allan import allan_variance, cluster_sizes, slope_rule
 from jaxnav.navigation.sensors.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
@@ -17,7 +18,6 @@ from jaxnav.navigation.states import SinsLevel
 from jaxnav.navigation.trajectory.arc import ArcProfile, fly_arc
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.studies.arekf.config import ArekfConfig, Sensor
-from jaxnav.studies.level_sins import Clock, sense
 from jaxnav.units import DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
 
 LONGEST_CLUSTER_S = 0.35
@@ -138,7 +138,9 @@ def fly_run(key: Array, world: World, timing: Timing) -> Run:
         timing: Rates and periods.
     """
     start_key, static_key, imu_key, gnss_key = jax.random.split(key, 4)
-    seen = sense(start_key, imu_key, world.trajectory, world.noise, world.prior_sigma, timing.clock)
+    seen = sense_level(
+        start_key, imu_key, world.trajectory, world.noise, world.prior_sigma, timing.clock
+    )
     steps = seen.inputs.dt.shape[0]
     z = observe_gnss(gnss_key, seen.truth.velocity, seen.truth.position, world.fixes)
     arrived = jnp.arange(1, steps + 1) % timing.steps_per_fix == 0

@@ -15,7 +15,8 @@ from jaxnav.navigation.models.sins_cns import (
     inputs_from_solution,
     sins_cns,
 )
-from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
+from jaxnav.navigation.sense import imu_samples, initial_error
+from jaxnav.navigation.sensors.imu import ImuErrors
 from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.states import LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
@@ -161,7 +162,7 @@ def fly_sins(key: Array, world: World, period: float, imu_step: float) -> Run:
         imu_step: Interval of the inertial samples [s].
     """
     start_key, imu_key, star_key = jax.random.split(key, 3)
-    error0 = _initial_error(start_key, world)
+    error0 = world.start_mean + initial_error(start_key, world.start_root)
     true0 = jax.tree.map(lambda leaf: leaf[0], world.trajectory.state)
     start = NavState(
         dcm=matmul(so3_exp(error0[LAYOUT.phi]), true0.dcm),
@@ -171,14 +172,7 @@ def fly_sins(key: Array, world: World, period: float, imu_step: float) -> Run:
     errors = ImuErrors(
         world.noise.gyro_noise, world.noise.accel_noise, error0[LAYOUT.eps], error0[LAYOUT.nabla]
     )
-    dtheta, dvel = corrupt(
-        imu_key,
-        errors,
-        world.trajectory.dtheta,
-        world.trajectory.dvel,
-        imu_step,
-        world.sample_scale,
-    )
+    dtheta, dvel = imu_samples(imu_key, world.trajectory, errors, imu_step, world.sample_scale)
     every = round(period / imu_step)
     solution = mechanise_launch_inertial(start, dtheta, dvel, imu_step, world.radius, every)
     star = observe_attitude(star_key, world.dcm, world.noise.star_noise)
@@ -216,13 +210,6 @@ def fly_linear(key: Array, world: World, period: float, imu_step: float) -> Run:
     accel = jax.vmap(matmul)(dcm, white[:, 3:] * world.noise.accel_noise[None])
     process = jnp.concatenate([gyro, accel, jnp.zeros((steps, 9), gyro.dtype)], axis=1)
     star = jax.random.normal(star_key, (steps, 3), sigma.dtype) * world.noise.star_noise[None]
-    start = _initial_error(start_key, world)
+    start = world.start_mean + initial_error(start_key, world.start_root)
     error, z = simulate(model, world.noise, start, world.nominal, process, star)
     return Run(world.nominal, z, error)
-
-
-def _initial_error(key: Array, world: World) -> Array:
-    # A product with a matrix, not with a vector: XLA fuses the latter, and with it the generator,
-    # into every sample of the IMU that the drawn drift and bias go to, at twice the cost of a run.
-    mean = world.start_mean
-    return mean + world.start_root @ jax.random.normal(key, mean.shape, mean.dtype)

@@ -9,7 +9,8 @@ from jax import Array
 from jaxnav.compiling import compiled, host
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_total import SinsTotalInput, SinsTotalParams, StarForm
-from jaxnav.navigation.sensors.imu import ImuErrors, corrupt, markov_error
+from jaxnav.navigation.sense import imu_samples, initial_error, opposite_biases
+from jaxnav.navigation.sensors.imu import ImuErrors, markov_error
 from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.states import LAYOUT, SinsTotal, retract_total
 from jaxnav.navigation.strapdown.base import NavState
@@ -135,15 +136,14 @@ def fly(key: Array, world: World, period: float, imu_step: float, star: StarForm
     start_key, bias_key, imu_key, star_key = jax.random.split(key, 4)
     every = round(period / imu_step)
     error0 = _initial_error(start_key, world)
-    # The filters start at no drift and no bias, so the truth is the opposite of the error.
-    drift, bias0 = -error0[LAYOUT.eps], -error0[LAYOUT.nabla]
+    drift, bias0 = opposite_biases(error0)
     samples = world.sample_scale.shape[0]
     bias = markov_error(
         bias_key, world.noise.bias_sigma, world.noise.bias_time, bias0, imu_step, samples
     )
     errors = ImuErrors(world.noise.gyro_noise, world.noise.accel_noise, drift, bias)
     motion = world.trajectory
-    sensed = corrupt(imu_key, errors, motion.dtheta, motion.dvel, imu_step, world.sample_scale)
+    sensed = imu_samples(imu_key, motion, errors, imu_step, world.sample_scale)
     dtheta, dvel = accumulate(*sensed, every)
     seen = observe_attitude(star_key, world.epochs.dcm, world.noise.star_noise)
     report = {"rotation-vector": so3_log, "euler": euler_from_dcm}[star]
@@ -160,10 +160,7 @@ def fly(key: Array, world: World, period: float, imu_step: float, star: StarForm
 
 def _initial_error(key: Array, world: World) -> Array:
     """Draw the initial error ``(15,)`` from P0, the attitude's of a given size if there is one."""
-    # A product with a matrix, not with a vector: XLA fuses the latter, and with it the generator,
-    # into every sample of the IMU that the drawn drift and bias go to.
-    sigma = world.prior_sigma
-    drawn = jnp.diag(sigma) @ jax.random.normal(key, sigma.shape, sigma.dtype)
+    drawn = initial_error(key, world.prior_sigma)
     phi = drawn[LAYOUT.phi]
     sized = phi * world.misalignment / jnp.sqrt(jnp.sum(phi * phi))
     return drawn.at[LAYOUT.phi].set(jnp.where(world.misalignment > 0, sized, phi))

@@ -17,7 +17,8 @@ from jaxnav.navigation.earth import MEAN_RADIUS
 from jaxnav.navigation.limb import seen_refraction
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsInput, observations
 from jaxnav.navigation.models.sins_total import SinsTotalInput, SinsTotalParams, sins_total
-from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
+from jaxnav.navigation.sense import imu_samples, initial_error, opposite_biases, true_states
+from jaxnav.navigation.sensors.imu import ImuErrors
 from jaxnav.navigation.sensors.refraction import Camera, measure, pick, view
 from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.stars import StarCatalogue, brighter, dcm_launch_icrs, directions
@@ -237,25 +238,20 @@ def fly_run(key: Array, world: World, timing: Timing) -> Run:
         timing: Rates and periods.
     """
     start_key, imu_key, star_key, limb_key, density_key, lost_key = jax.random.split(key, 6)
-    # A product with a matrix, not with a vector: XLA fuses the latter, and with it the generator,
-    # into every sample of the IMU that the drawn drift and bias go to.
-    sigma = world.prior_sigma
-    error0 = jnp.diag(sigma) @ jax.random.normal(start_key, sigma.shape, sigma.dtype)
-    # The filters start at no drift and no bias, so the truth is the opposite of the error.
-    drift, bias = -error0[LAYOUT.eps], -error0[LAYOUT.nabla]
+    error0 = initial_error(start_key, world.prior_sigma)
+    drift, bias = opposite_biases(error0)
     motion = world.trajectory
     errors = ImuErrors(world.noise.gyro_noise, world.noise.accel_noise, drift, bias)
-    quiet = jnp.ones(motion.dtheta.shape[0], sigma.dtype)
-    turns, gains = corrupt(imu_key, errors, motion.dtheta, motion.dvel, timing.imu_step, quiet)
+    turns, gains = imu_samples(imu_key, motion, errors, timing.imu_step)
     launched = timing.launch_samples
     start = _dead_reckoned(world, timing, turns[:launched], gains[:launched], error0)
     turns, gains = turns[launched:], gains[launched:]
     every = round(timing.period / timing.imu_step)
-    truth = _truth(motion, launched, every, drift, bias)
+    truth = true_states(SinsTotal, motion, every, drift, bias, launched)
     before, after = (jax.tree.map(lambda leaf, at=at: leaf[at], truth) for at in _ENDS)
     dtheta, dvel = accumulate(turns, gains, every)
     steps = world.limb.seen.shape[0]
-    density = 1 + world.density_error * jax.random.normal(density_key, (), sigma.dtype)
+    density = 1 + world.density_error * jax.random.normal(density_key, (), error0.dtype)
     angle = _bent(world, after.position, density)
     angle = measure(limb_key, angle, world.refraction_noise)
     tracker = observe_attitude(star_key, after.dcm, world.noise.star_noise)
@@ -265,9 +261,9 @@ def fly_run(key: Array, world: World, timing: Timing) -> Run:
     both = jnp.ones((steps, 3), bool)
     return Run(
         start=_lost(lost_key, world, start),
-        conventional=SinsTotalInput(dtheta, dvel, jnp.ones(steps, sigma.dtype)),
+        conventional=SinsTotalInput(dtheta, dvel, jnp.ones(steps, error0.dtype)),
         limb=SinsRkcnsInput(
-            dtheta, world.limb.star, angle, jnp.ones(steps, sigma.dtype), before, after
+            dtheta, world.limb.star, angle, jnp.ones(steps, error0.dtype), before, after
         ),
         density=density,
         z=z,
@@ -277,14 +273,6 @@ def fly_run(key: Array, world: World, timing: Timing) -> Run:
 
 
 _ENDS = (slice(None, -1), slice(1, None))
-
-
-def _truth(motion: Trajectory, first: int, every: int, drift: Array, bias: Array) -> SinsTotal:
-    """Return the true states ``(K + 1)`` from the start of the filters on."""
-    at = jax.tree.map(lambda leaf: leaf[first::every], motion.state)
-    shape = at.velocity.shape
-    constant = jnp.broadcast_to(drift, shape), jnp.broadcast_to(bias, shape)
-    return SinsTotal(at.dcm, at.velocity, at.position, *constant)
 
 
 def _dead_reckoned(

@@ -19,8 +19,8 @@ from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, WeightRule, replicate
 from jaxnav.navigation.earth import displaced, offset_between
 from jaxnav.navigation.models.sins_gnss import CHANNELS, sins_gnss
+from jaxnav.navigation.sense import Clock
 from jaxnav.navigation.states import LAYOUT
-from jaxnav.studies.level_sins import Clock
 from jaxnav.studies.sage_husa.config import WINDOWS_S, SageHusaConfig
 from jaxnav.studies.sage_husa.simulation import (
     DriveParams,

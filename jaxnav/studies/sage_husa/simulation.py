@@ -10,11 +10,11 @@ from jaxnav.compiling import host
 from jaxnav.estimation.types import Gaussian, Model, Obs, SureObs, seeing
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
+from jaxnav.navigation.sense import Clock, sense_level
 from jaxnav.navigation.sensors.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.states import SinsLevel
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.vehicle import VehicleProfile, drive, town_legs
-from jaxnav.studies.level_sins import Clock, sense
 from jaxnav.studies.sage_husa.config import SageHusaConfig
 from jaxnav.units import DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, MICRO_G
 
@@ -150,7 +150,7 @@ def drive_run(key: Array, world: World, clock: Clock) -> Run:
         clock: Rates.
     """
     start_key, imu_key, gnss_key, added_key = jax.random.split(key, 4)
-    seen = sense(start_key, imu_key, world.trajectory, world.noise, world.prior_sigma, clock)
+    seen = sense_level(start_key, imu_key, world.trajectory, world.noise, world.prior_sigma, clock)
     fixes = GnssErrors(world.noise.velocity_noise, world.noise.position_noise)
     z = observe_gnss(gnss_key, seen.truth.velocity, seen.truth.position, fixes)
     white = jax.random.normal(added_key, (z.shape[0], 2), z.dtype)
