@@ -20,6 +20,7 @@ from jax import Array
 
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import gravity_gradient_launch_inertial
+from jaxnav.navigation.states import ATTITUDE_LAYOUT, LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.launch_inertial import NavSolution
 from jaxnav.numerics.lie import skew
