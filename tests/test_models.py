@@ -1,6 +1,7 @@
 """Models put together of a process and named channels equal those stacked by hand."""
 
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,7 @@ def test_a_model_of_channels_is_the_one_stacked_by_hand() -> None:
     np.testing.assert_allclose(part.nis, expected, rtol=1e-12)
 
 
+NOT_ONE: Any = PROCESS
 LONG = LINE._replace(size=2)
 SEEN = Obs(jnp.ones((2, 3)), jnp.ones((2, 3), bool))
 MISUSE = {
@@ -65,7 +67,7 @@ MISUSE = {
     "two of one name": (lambda: observing(PROCESS, {"a": LINE}, {"a": BENT}), "two channels 'a'"),
     "the name of the process": (lambda: observing(PROCESS, {"process": LINE}), "named 'process'"),
     "no size": (lambda: observing(PROCESS, {"a": LINE._replace(size=0)}), "it must be 1 or more"),
-    "no Channel": (lambda: observing(PROCESS, {"a": PROCESS}), "'a' is Process, not a Channel"),
+    "no Channel": (lambda: observing(PROCESS, {"a": NOT_ONE}), "'a' is Process, not a Channel"),
     "unknown name": (lambda: WHOLE.channel("lime"), "did you mean 'line'"),
     "no values": (lambda: WHOLE.stack({}), "no values to stack"),
     "values of another size": (

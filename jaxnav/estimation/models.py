@@ -10,7 +10,7 @@ makes a :class:`~jaxnav.estimation.types.Model` of them in which every channel k
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -109,6 +109,9 @@ def shared(params: Params, name: str) -> Params:
     return params
 
 
+_Part = TypeVar("_Part", Model, Process, Channel)
+
+
 def observing(process: Process, *channels: Mapping[str, Channel], parts: Parts = by_name) -> Model:
     """Return the model of a process that is seen by channels, stacked in the order given.
 
@@ -173,10 +176,10 @@ def observing(process: Process, *channels: Mapping[str, Channel], parts: Parts =
 
 
 def adapted(
-    part: Any,
+    part: _Part,
     params: Callable[[Params], Params] | None = None,
     u: Callable[[Input], Input] | None = None,
-) -> Any:
+) -> _Part:
     """Return a model, process or channel that takes its parameters or input out of wider ones.
 
     Args:
