@@ -162,7 +162,7 @@ def test_float32_stays_float32(name: str) -> None:
     expected = kalman(by_hand, z, VALID)
     found, info = run_linear(MAKERS[name](model, iterations=2), jnp.float32)
     for leaf in jax.tree.leaves((found, info)):
-        assert leaf.dtype in (jnp.float32, jnp.int32)
+        assert leaf.dtype in (jnp.float32, jnp.int32, jnp.bool_)
     for i, bound in enumerate((1e-5, 1e-5, 1e-4)):
         np.testing.assert_allclose(found.mean[i], expected.mean, rtol=0, atol=bound)
         np.testing.assert_allclose(found.cov[i], expected.cov, rtol=0, atol=bound)

@@ -70,7 +70,7 @@ def reset(own: WindowedReset, smooth: bool) -> tuple[Array, Array]:
     """Both sets of weights after a step in which the second prefers another model."""
     zero, whole = jnp.zeros(4), jnp.zeros(4, jnp.int32)
     window, seen = WEIGHTS[::-1], jnp.array([-3.0, -2.0, -0.5, -1.0])
-    info = Info(zero[:, None], jnp.ones((4, 1, 1)), seen, zero, whole, whole)
+    info = Info(zero[:, None], jnp.ones((4, 1, 1)), seen, zero, whole, whole, whole > 0, whole > 0)
     rule = windowed_reset(smooth=smooth)
     return rule.update(own, window, WEIGHTS, info, jnp.array(8, jnp.int32))
 
@@ -161,7 +161,7 @@ def test_the_smooth_clamp() -> None:
 def moved(own: Adaptation, innovation: Array, smooth: bool, log_factor: float = 0.0) -> Array:
     """The log-factor of an adaptive filter after an innovation of unit covariance, or none."""
     zero, whole = jnp.zeros(()), jnp.zeros((), jnp.int32)
-    info = Info(innovation, jnp.eye(1), zero, zero, whole, whole)
+    info = Info(innovation, jnp.eye(1), zero, zero, whole, whole, whole > 0, whole > 0)
     obs = Obs(innovation, jnp.isfinite(innovation))
     return moved_log_factor(own, jnp.array(log_factor), info, obs, smooth=smooth)
 

@@ -143,7 +143,7 @@ def made_up(runs: int, steps: int) -> Watched:
     spread = jnp.array([-4.0, -2.0, 0.0, 3.0])
     none = jnp.zeros((*shape, 0))
     flags = jnp.zeros(shape, jnp.int32)
-    info = Info(none, none, spread[None, None] - 0.5 * nis, nis, flags, flags)
+    info = Info(none, none, spread[None, None] - 0.5 * nis, nis, flags, flags, flags > 0, flags > 0)
     return Watched(info, jnp.array(rng.normal(size=(*shape, 2)) * [[2.0], [1.5], [1.0], [3.0]]))
 
 

@@ -49,7 +49,9 @@ def info_of(log_likelihood: jax.Array) -> Info:
     flags = jnp.zeros(log_likelihood.shape[0], jnp.int32)
     known = jnp.isfinite(log_likelihood)
     nis = jnp.where(known, -2 * log_likelihood - math.log(2 * math.pi), 0)
-    return Info(zero[:, None], jnp.ones((zero.size, 1, 1)), log_likelihood, nis, flags, flags)
+    none = flags[:, None] > 0
+    one = jnp.ones((zero.size, 1, 1))
+    return Info(zero[:, None], one, log_likelihood, nis, flags, flags, none, none)
 
 
 def weigh(
@@ -222,7 +224,9 @@ def innovations(S: np.ndarray, true: float, seed: int, steps: int = SEEN) -> Inf
     log_likelihood = -0.5 * (nis + np.log(2 * np.pi * S))
     variance = np.broadcast_to(S, nis.shape)[..., None, None]
     wide = jnp.array(np.broadcast_to(nu, nis.shape)[..., None])
-    return Info(wide, jnp.array(variance), jnp.array(log_likelihood), jnp.array(nis), flags, flags)
+    none = flags[..., None] > 0
+    seen = jnp.array(variance), jnp.array(log_likelihood), jnp.array(nis)
+    return Info(wide, *seen, flags, flags, none, none)
 
 
 @compiled

@@ -5,7 +5,8 @@ argument and is never closed over. So a bank is a ``vmap`` over parameters, a Mo
 ``vmap`` over keys, and tuning a ``grad`` through both.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from enum import IntFlag
 from typing import Any, NamedTuple, Protocol
 
@@ -14,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
+
+from jaxnav.numerics.linalg import normalised_square
 
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
@@ -109,6 +112,8 @@ class Info(NamedTuple):
         nis: Normalised innovation squared, chi-square with ``sum(valid)`` degrees of freedom.
         iterations: Number of iterations of the update.
         flags: Sum of :class:`Flag`.
+        used: ``(m,)`` channels that took part in the update; of a bank, in that of any member.
+        refused: ``(m,)`` channels that a gate left out, having contradicted the prediction.
     """
 
     innovation: Float[Array, " m"]
@@ -117,9 +122,30 @@ class Info(NamedTuple):
     nis: Scalar
     iterations: Int[Array, ""]
     flags: Int[Array, ""]
+    used: Mask
+    refused: Mask
 
 
-def _difference(z: Array, z_pred: Array) -> Array:
+class ChannelInfo(NamedTuple):
+    """What an update tells of one channel of size ``m``; see :class:`Info`.
+
+    Attributes:
+        innovation: ``(..., m)``.
+        innovation_cov: ``(..., m, m)``.
+        nis: ``(...)`` chi-square with ``sum(used)`` degrees of freedom.
+        used: ``(..., m)``.
+        refused: ``(..., m)``.
+    """
+
+    innovation: Array
+    innovation_cov: Array
+    nis: Array
+    used: Array
+    refused: Array
+
+
+def difference(z: Array, z_pred: Array) -> Array:
+    """Return ``z - z_pred``: the ``residual`` of values that just subtract."""
     return z - z_pred
 
 
@@ -163,59 +189,104 @@ class Model(NamedTuple):
         retract: ``(x, dx) -> x``; the default adds.
         local: ``(x, y) -> dx`` with ``retract(x, dx) == y``; the default subtracts.
         jacobians: ``(params, x, u) -> (Phi, H)`` in tangent coordinates, each a matrix or, for
-            structure that a matrix would hide, the linear function it stands for; ``None`` for
-            automatic differentiation.
+            structure that a matrix would hide, the linear function it stands for; ``None``, or a
+            ``None`` in its place, for automatic differentiation.
         noisy: The observation with noise that does not just add, for filters that augment the state
             with it; ``observation_noise`` is then its covariance in the channels, to first order.
+        channels: Name and size of each sensor's part of the observation, in order, as
+            :func:`~jaxnav.estimation.models.observing` has them; ``()`` where they have no names.
     """
 
     transition: Callable[[Params, Point, Input], Point]
     process_noise: Callable[[Params, Point, Input], Matrix]
     observe: Callable[[Params, Point, Input], Array]
     observation_noise: Callable[[Params, Point, Input], Array]
-    residual: Callable[[Array, Array], Array] = _difference
+    residual: Callable[[Array, Array], Array] = difference
     retract: Callable[[Point, Array], Point] = add
     local: Callable[[Point, Point], Array] = subtract
-    jacobians: Callable[[Params, Point, Input], tuple[LinearMap, LinearMap]] | None = None
+    jacobians: (
+        Callable[[Params, Point, Input], tuple[LinearMap | None, LinearMap | None]] | None
+    ) = None
     noisy: NonAdditive | None = None
+    channels: tuple[tuple[str, int], ...] = ()
+
+    def channel(self, name: str) -> slice:
+        """Return where a channel is in an observation.
+
+        Raises:
+            ValueError: If the model has none of that name.
+        """
+        first = 0
+        for own, size in self.channels:
+            if own == name:
+                return slice(first, first + size)
+            first += size
+        names = [own for own, _ in self.channels]
+        near = get_close_matches(name, names, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        have = ", ".join(names) or "not named"
+        raise ValueError(f"the model has no channel {name!r}; its channels are {have}{hint}")
+
+    def stack(self, values: Mapping[str, Any], valid: Mapping[str, Any] | None = None) -> Obs:
+        """Return the observations of some channels by name; the others are missing.
+
+        Args:
+            values: Measurements ``(..., m)`` of each channel, with the same leading axes.
+            valid: Which of them arrived, ``(..., m)`` or ``(...)`` by name; the default is those
+                that are finite.
+
+        Raises:
+            ValueError: If a name is unknown, a measurement has not its channel's size, leading axes
+                differ, or there is no measurement.
+        """
+        arrays = {name: jnp.asarray(value) for name, value in values.items()}
+        marks = {name: jnp.asarray(mark) for name, mark in (valid or {}).items()}
+        leading = None
+        for name, z in arrays.items():
+            size = dict(self.channels).get(name) or self.channel(name)
+            if z.ndim == 0 or z.shape[-1] != size:
+                raise ValueError(
+                    f"the values of channel {name!r} are {z.shape}; the last axis must be {size}"
+                )
+            if leading not in (None, z.shape[:-1]):
+                raise ValueError(
+                    f"the values of channel {name!r} have the leading axes {z.shape[:-1]}, others "
+                    f"{leading}; all must have the same"
+                )
+            leading = z.shape[:-1]
+        if leading is None:
+            raise ValueError("there are no values to stack; give those of one channel or more")
+        for name in marks:
+            if name not in arrays:
+                raise ValueError(f"valid names channel {name!r}, which has no values")
+        z, known = [], []
+        for name, size in self.channels:
+            value = arrays.get(name, jnp.full((*leading, size), jnp.nan))
+            finite = jnp.isfinite(value)
+            if name in marks:
+                mark = marks[name]
+                wide = mark[..., None] if mark.ndim == len(leading) else mark
+                finite = jnp.broadcast_to(wide, value.shape)
+            z.append(jnp.where(finite, value, 0))
+            known.append(finite)
+        return Obs(jnp.concatenate(z, axis=-1), jnp.concatenate(known, axis=-1))
+
+    def part(self, info: Info, name: str) -> ChannelInfo:
+        """Return what an update, or a record of updates, tells of one channel.
+
+        Args:
+            info: Of this model's filter or bank; leaves may have leading axes.
+            name: Of the channel, or ``ValueError``.
+        """
+        at = self.channel(name)
+        nu, S = info.innovation[..., at], info.innovation_cov[..., at, at]
+        square = jnp.vectorize(normalised_square, signature="(m),(m,m)->()")
+        return ChannelInfo(nu, S, square(nu, S), info.used[..., at], info.refused[..., at])
 
 
 def accept(*given: Any) -> None:
     """Take any parameters: the check of a filter or rule that has none."""
     del given
-
-
-def _itself(u: Input) -> Input:
-    return u
-
-
-def seeing(
-    model: Model,
-    own: Callable[[Params], Params],
-    sensed: Callable[[Input], Input] = _itself,
-) -> Model:
-    """Return a model of wider parameters and inputs that does with its part of them what it did.
-
-    For models that add something to another one: what they change is then replaced.
-
-    Args:
-        model: The model.
-        own: Its parameters as a part of the wider ones.
-        sensed: Its input as a part of the wider one; the default is all of it.
-    """
-    jacobians, noisy = model.jacobians, model.noisy
-    return model._replace(
-        transition=lambda params, x, u: model.transition(own(params), x, sensed(u)),
-        process_noise=lambda params, x, u: model.process_noise(own(params), x, sensed(u)),
-        observe=lambda params, x, u: model.observe(own(params), x, sensed(u)),
-        observation_noise=lambda params, x, u: model.observation_noise(own(params), x, sensed(u)),
-        jacobians=jacobians and (lambda params, x, u: jacobians(own(params), x, sensed(u))),
-        noisy=noisy
-        and NonAdditive(
-            lambda params, x, v, u: noisy.observe(own(params), x, v, sensed(u)),
-            lambda params, x, u: noisy.noise(own(params), x, sensed(u)),
-        ),
-    )
 
 
 class FilterParams(NamedTuple):

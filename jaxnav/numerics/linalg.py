@@ -235,6 +235,12 @@ def log_det(L: Array) -> Array:
     return 2 * jnp.sum(jnp.log(jnp.diag(L)))
 
 
+def normalised_square(nu: Array, S: Array) -> Array:
+    """Return ``nu' inv(S) nu`` of a vector ``(m,)`` and a covariance ``(m, m)``."""
+    white = solve_lower(cholesky(S).factor, nu)
+    return jnp.sum(white * white)
+
+
 @jax.custom_jvp
 def solve_positive(L: Array, S: Array, B: Array) -> Array:
     """Return ``inv(S) B`` from the lower Cholesky factor ``L`` of ``S``, all that the value reads.

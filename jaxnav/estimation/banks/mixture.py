@@ -342,4 +342,6 @@ def mixture_info(log_weights: Array, info: Info) -> Info:
         nis=jnp.where(root.positive_definite, jnp.sum(whitened * whitened), 0),
         iterations=jnp.max(jnp.where(used, info.iterations, 0)),
         flags=jax.lax.reduce(bits, jnp.zeros((), jnp.int32), jax.lax.bitwise_or, (0,)) | raised,
+        used=jnp.any(info.used & used[:, None], axis=0),
+        refused=jnp.any(info.refused & used[:, None], axis=0),
     )

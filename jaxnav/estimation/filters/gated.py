@@ -88,7 +88,7 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
     def update(params: Gated, state: GatedState, u: Input, obs: Obs) -> tuple[GatedState, Info]:
         plain = filter.update(params.inner, state.inner, u, obs)
         squares = jnp.stack([nis_of(plain[1], group) for group in groups])
-        used = obs.valid & ~_left_out(plain[1])
+        used = plain[1].used
         count = jnp.stack([jnp.sum(used[np.array(group)]) for group in groups])
         heard = count > 0
         dtype = squares.dtype
@@ -115,7 +115,7 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
         raised = raised | jnp.where(jnp.any(reopened), int(Flag.REOPENED), 0)
         refused = jnp.where(refuse, state.refused + 1, jnp.where(heard, 0, state.refused))
         flags = info.flags | raised.astype(jnp.int32)
-        return GatedState(inner, refused), info._replace(flags=flags)
+        return GatedState(inner, refused), info._replace(flags=flags, refused=channels)
 
     def estimate(state: GatedState) -> Any:
         return filter.estimate(state.inner)
@@ -124,12 +124,6 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
         return state._replace(inner=filter.restart(state.inner, given))
 
     return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
-
-
-def _left_out(info: Info) -> Array:
-    """Return which channels ``(m,)`` an update did not use, whatever the reason."""
-    alone = jnp.eye(len(info.innovation), dtype=info.innovation.dtype)
-    return (info.innovation == 0) & jnp.all(info.innovation_cov == alone, axis=1)
 
 
 def _tail(square: Array, count: Array) -> Array:

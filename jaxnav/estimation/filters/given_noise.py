@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 from jax import Array
 
-from jaxnav.estimation.types import FilterParams, Input, Model, Params, Point, seeing
+from jaxnav.estimation.models import adapted
+from jaxnav.estimation.types import FilterParams, Input, Model, Params, Point
 
 
 class GivenNoise(NamedTuple):
@@ -27,7 +28,7 @@ def with_given_noise(model: Model) -> Model:
     def process_noise(params: GivenNoise, x: Point, u: Input) -> Array:
         return params.process * model.process_noise(params.own, x, u)
 
-    return seeing(model, lambda params: params.own)._replace(
+    return adapted(model, lambda params: params.own)._replace(
         process_noise=process_noise,
         observation_noise=lambda params, x, u: params.observation,
     )

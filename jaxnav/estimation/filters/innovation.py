@@ -14,7 +14,7 @@ from jaxnav.estimation.checks import ROUNDING
 from jaxnav.estimation.debugging import check_covariance
 from jaxnav.estimation.types import Flag, Info, Model, Obs, SureObs, flags_of
 from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
-from jaxnav.numerics.linalg import Cholesky, cholesky, kernel, log_det, solve_lower
+from jaxnav.numerics.linalg import Cholesky, kernel, log_det, normalised_square, solve_lower
 from jaxnav.numerics.roots import semidefinite_root
 
 ILL_CONDITIONED_EPS = 1e3
@@ -138,9 +138,7 @@ def nis_of(info: Info, channels: Sequence[int]) -> Array:
     One that was not used counts nothing: its innovation is zero and its row that of the identity.
     """
     at = np.array(channels)
-    factor = cholesky(info.innovation_cov[at][:, at]).factor
-    white = solve_lower(factor, info.innovation[at])
-    return jnp.sum(white * white)
+    return normalised_square(info.innovation[at], info.innovation_cov[at][:, at])
 
 
 @kernel
@@ -220,5 +218,7 @@ def innovation_info(
         nis=nis,
         iterations=jnp.ones((), jnp.int32),
         flags=flags_of(raised),
+        used=valid,
+        refused=jnp.zeros_like(valid),
     )
     return told.upon(info)

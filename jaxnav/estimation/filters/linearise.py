@@ -27,8 +27,9 @@ def transition_map(
 ) -> tuple[Point, ColumnMap]:
     """Return ``f(x)`` and the map ``Phi`` of columns ``(n, k)`` from ``x`` to ``f(x)``."""
     y = model.transition(params, x, u)
-    if model.jacobians is not None:
-        return y, _columns(model.jacobians(params, x, u)[0])
+    own = None if model.jacobians is None else model.jacobians(params, x, u)[0]
+    if own is not None:
+        return y, _columns(own)
 
     def moved(dx: Array) -> Array:
         return model.local(y, model.transition(params, model.retract(x, dx), u))
@@ -41,8 +42,9 @@ def observation_map(
 ) -> tuple[Array, ColumnMap]:
     """Return ``h(x)`` ``(m,)`` and the map ``H`` of columns ``(n, k)`` to residuals ``(m, k)``."""
     z = model.observe(params, x, u)
-    if model.jacobians is not None:
-        return z, _columns(model.jacobians(params, x, u)[1])
+    own = None if model.jacobians is None else model.jacobians(params, x, u)[1]
+    if own is not None:
+        return z, _columns(own)
 
     def seen(dx: Array) -> Array:
         return model.residual(model.observe(params, model.retract(x, dx), u), z)

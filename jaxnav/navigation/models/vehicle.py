@@ -15,7 +15,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.types import Model, seeing
+from jaxnav.estimation.models import adapted
+from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import WGS84, Earth, displaced, earth_rate, offset_between
 from jaxnav.navigation.models.sins_gnss import (
     CHANNELS,
@@ -113,7 +114,7 @@ def vehicle(
         ValueError: As :func:`~jaxnav.navigation.models.sins_gnss.sins_gnss`.
     """
     plain = sins_gnss(error, origin, earth)
-    inner = seeing(plain, lambda params: params.inner, lambda u: u.inertial)
+    inner = adapted(plain, lambda params: params.inner, lambda u: u.inertial)
     form = error_form(error, jnp.zeros(3) if origin is None else origin, earth)
 
     def observe(params: VehicleParams, x: SinsLevel, u: VehicleInput) -> Array:

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.compiling import host
-from jaxnav.estimation.types import Gaussian, Model, Obs, SureObs, seeing
+from jaxnav.estimation.models import adapted
+from jaxnav.estimation.types import Gaussian, Model, Obs, SureObs
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.sense import Clock, sense_level
@@ -87,7 +88,7 @@ def informed(model: Model) -> Model:
         extra = params.knows * u.added**2 * horizontal
         return model.observation_noise(params.own, x, u.sensed) + extra
 
-    own = seeing(model, lambda params: params.own, lambda u: u.sensed)
+    own = adapted(model, lambda params: params.own, lambda u: u.sensed)
     return own._replace(observation_noise=observation_noise)
 
 
