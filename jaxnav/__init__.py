@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     )
     from jaxnav.estimation.banks.reset import WindowedReset as WindowedReset
     from jaxnav.estimation.banks.reset import windowed_reset as windowed_reset
+    from jaxnav.estimation.banks.rule import WeightRule as WeightRule
     from jaxnav.estimation.banks.weights import (
         Penalty as Penalty,
     )
@@ -107,6 +108,10 @@ if TYPE_CHECKING:
     from jaxnav.estimation.filters.sigma_point import ukf as ukf
     from jaxnav.estimation.filters.square_root import square_root_ekf as square_root_ekf
     from jaxnav.estimation.filters.square_root import square_root_kf as square_root_kf
+    from jaxnav.estimation.models import Channel as Channel
+    from jaxnav.estimation.models import ModelParams as ModelParams
+    from jaxnav.estimation.models import Process as Process
+    from jaxnav.estimation.models import observing as observing
     from jaxnav.estimation.montecarlo import RunOutput as RunOutput
     from jaxnav.estimation.montecarlo import monte_carlo as monte_carlo
     from jaxnav.estimation.run import run as run
@@ -138,9 +143,6 @@ if TYPE_CHECKING:
         SureObs as SureObs,
     )
     from jaxnav.estimation.types import (
-        WeightRule as WeightRule,
-    )
-    from jaxnav.estimation.types import (
         observed as observed,
     )
     from jaxnav.estimation.types import (
@@ -156,6 +158,7 @@ _HOMES = {
         "mmae",
         "panel",
     ),
+    "jaxnav.estimation.banks.rule": ("WeightRule",),
     "jaxnav.estimation.banks.weights": (
         "Penalty",
         "bayes",
@@ -185,6 +188,7 @@ _HOMES = {
         "ukf",
     ),
     "jaxnav.estimation.filters.square_root": ("square_root_ekf", "square_root_kf"),
+    "jaxnav.estimation.models": ("Channel", "ModelParams", "Process", "observing"),
     "jaxnav.estimation.montecarlo": ("RunOutput", "monte_carlo"),
     "jaxnav.estimation.run": ("run", "simulate"),
     "jaxnav.estimation.tune.fit": ("fit",),
@@ -198,7 +202,6 @@ _HOMES = {
         "Model",
         "Obs",
         "SureObs",
-        "WeightRule",
         "observed",
         "replicate",
     ),

@@ -55,6 +55,14 @@ def optimised_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiling, "OPTIONS", OPTIMISED)
 
 
+@pytest.fixture(scope="module")
+def optimised_module() -> Iterator[None]:
+    """The same for all of a module, what its tests share included."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiling, "OPTIONS", OPTIMISED)
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def programs_end_with_their_module() -> Iterator[None]:
     """Drop the compiled programs of a module after its last test.

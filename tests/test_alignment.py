@@ -12,15 +12,15 @@ from jaxnav.navigation.alignment import (
     gyro_compass,
     static_biases,
 )
-from jaxnav.navigation.earth import FLAT, WGS84, offset_between
-from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
-from jaxnav.navigation.sensors.gnss import (
+from jaxnav.navigation.channels.gnss import (
     GnssErrors,
     antenna_motion,
     dilution_gate,
     observe_gnss,
     outages,
 )
+from jaxnav.navigation.earth import FLAT, WGS84, offset_between
+from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams, sins_gnss
 from jaxnav.navigation.states import SinsLevel
 from jaxnav.units import DEG, DEG_PER_HOUR
 from tests.oracles import rotations

@@ -31,8 +31,8 @@ from jaxnav.estimation.tune.fit import fit, fit_lbfgs
 from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs, replicate
 from jaxnav.navigation.atmosphere import refraction_angle
+from jaxnav.navigation.channels.refraction import raised
 from jaxnav.navigation.limb import ray_height, separation
-from jaxnav.navigation.sensors.refraction import raised
 from jaxnav.numerics.linalg import cholesky, safe_sqrt
 from jaxnav.numerics.roots import tria, update_array
 from jaxnav.numerics.sigma import SigmaRule, unscented

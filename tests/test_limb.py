@@ -21,6 +21,7 @@ from jaxnav.navigation.atmosphere import (
     table_angle,
     tabulate,
 )
+from jaxnav.navigation.channels.refraction import Camera, Sight, measure, pick, view
 from jaxnav.navigation.earth import MEAN_RADIUS
 from jaxnav.navigation.limb import (
     exponential_model,
@@ -30,7 +31,6 @@ from jaxnav.navigation.limb import (
     seen_refraction,
     separation,
 )
-from jaxnav.navigation.sensors.refraction import Camera, Sight, measure, pick, view
 from jaxnav.units import ARCSEC, DEG
 
 HEIGHTS = np.array([20.0, 25.0, 30.0, 35.0, 40.0]) * 1e3

@@ -24,7 +24,7 @@ from jaxnav.datasets.track import GnssTrack
 from jaxnav.estimation.filters.linearise import jacobians
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
-from jaxnav.navigation.models.vehicle import FIXES, REST, VehicleInput, VehicleParams, vehicle
+from jaxnav.navigation.models.vehicle import VehicleInput, VehicleParams, vehicle
 from jaxnav.navigation.states import LevelError, SinsLevel
 from jaxnav.navigation.trajectory.vehicle import Leg, VehicleProfile, drive
 from jaxnav.numerics.lie import so3_exp
@@ -187,13 +187,15 @@ def test_a_stop_is_not_believed_at_speed() -> None:
     _, true = simulated()
     x = jax.tree.map(lambda leaf: leaf[0], true)
     u = jax.tree.map(lambda leaf: leaf[0], prepare(simulated()[0], QUIET, 10.0).inputs)
+    model = vehicle()
+    rest = model.channel("rest")
     sigma = [
-        np.sqrt(vehicle().observation_noise(PARAMS, x._replace(velocity=jnp.array([v, 0, 0])), u))
+        np.sqrt(model.observation_noise(PARAMS, x._replace(velocity=jnp.array([v, 0, 0])), u))[rest]
         for v in (0.0, 1.0, 12.0, 1e4)
     ]
-    np.testing.assert_allclose(sigma[0][REST], 0.05)
-    np.testing.assert_allclose(sigma[1][REST], 0.05 * np.exp(0.5))
-    assert sigma[2][REST].min() > 1e6
+    np.testing.assert_allclose(sigma[0], 0.05)
+    np.testing.assert_allclose(sigma[1], 0.05 * np.exp(0.5))
+    assert sigma[2].min() > 1e6
     assert np.isfinite(sigma[3]).all()
 
 
@@ -205,9 +207,9 @@ def test_each_fix_is_observed_in_the_nearest_period() -> None:
     np.testing.assert_allclose(ready.time[ready.fix_step] + lag, fix_time, atol=1e-9)
     assert np.abs(lag).max() <= 0.5 / 7 + 1e-9
     assert len(set(ready.fix_step)) == len(ready.fix_step)
-    valid = np.asarray(ready.observations.valid)
-    assert valid[:, FIXES].any(axis=1).sum() == len(ready.fix)
-    assert not valid[~ready.stopped][:, REST].any()
+    fixed = [ready.channels[name].valid.any(axis=1) for name in ("velocity", "position")]
+    assert (fixed[0] | fixed[1]).sum() == len(ready.fix)
+    assert not ready.channels["rest"].valid[~ready.stopped].any()
     assert ready.at_rest
 
 
@@ -254,8 +256,10 @@ def test_diverged_needs_ten_seconds_of_far_fixes(report: Report) -> None:
     lost = kept.mean._replace(velocity=kept.mean.velocity.at[-1, 0].set(jnp.nan))
     assert diverged(kept._replace(mean=lost), drive_)
     for fixes, verdict in ((20, False), (60, True)):
-        far = kept.innovation.at[jnp.asarray(drive_.fix_step[50 : 50 + fixes]), 3].set(150.0)
-        assert diverged(kept._replace(innovation=far), drive_) is verdict
+        part = kept.parts["position"]
+        far = part.innovation.at[jnp.asarray(drive_.fix_step[50 : 50 + fixes]), 0].set(150.0)
+        parts = {**kept.parts, "position": part._replace(innovation=far)}
+        assert diverged(kept._replace(parts=parts), drive_) is verdict
 
 
 def test_files_parse_back(report: Report, tmp_path: Path) -> None:

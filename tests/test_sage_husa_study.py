@@ -21,6 +21,8 @@ from jaxnav.studies.sage_husa.methods import BANKS, HORIZONTAL, horizontal
 from jaxnav.studies.sage_husa.study import compared, run_campaign
 from tests.oracles.matrices import random_spd
 
+pytestmark = pytest.mark.usefixtures("optimised_module")
+
 
 @pytest.mark.parametrize(
     ("given", "told"),

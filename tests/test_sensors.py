@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxnav.compiling import compiled
+from jaxnav.navigation.channels.star import observe_attitude
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt, markov_error
-from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.numerics.lie import so3_exp, so3_log
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 

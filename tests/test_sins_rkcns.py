@@ -36,8 +36,8 @@ def program(model: Model) -> Model:
     return model._replace(**{name: compiled(getattr(model, name)) for name in equations})
 
 
-HEIGHTS = program(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS))
-ANGLES = program(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, "angle"))
+HEIGHTS = program(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, 3))
+ANGLES = program(sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, 3, "angle"))
 MODELS: dict[RayForm, Model] = {"height": HEIGHTS, "angle": ANGLES}
 CENTRE = np.array([0.0, MEAN_RADIUS, 0.0])
 
@@ -220,12 +220,18 @@ def test_with_no_star_in_view_the_filter_uses_the_rest_and_says_how_much() -> No
 def test_no_stars_at_all_leaves_attitude_and_accelerometers() -> None:
     x = state()
     bare = seen()._replace(star=jnp.zeros((0, 3)), angle=jnp.zeros(0))
-    assert HEIGHTS.observe(params(), x, bare).shape == (6,)
-    R = HEIGHTS.observation_noise(params(), x, bare)
-    assert R.shape == (6, 6)
-    assert np.all(np.diag(R) > 0)
+    without = sins_rkcns(PERIOD, IMU_STEP, MEAN_RADIUS, 0)
+    assert [name for name, _ in without.channels] == ["attitude", "accelerometer"]
+    assert without.observe(params(), x, bare).shape == (6,)
+    assert np.all(without.observation_noise(params(), x, bare) > 0)
+
+
+def test_another_number_of_stars_than_the_model_has_is_refused() -> None:
+    bare = seen()._replace(star=jnp.zeros((2, 3)), angle=jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"the input has stars \(2, 3\) and angles \(2,\); .* 3"):
+        HEIGHTS.observe(params(), state(), bare)
 
 
 def test_an_unknown_form_is_refused() -> None:
     with pytest.raises(ValueError, match="ray is 'length'; it must be one of height, angle"):
-        sins_rkcns(1.0, 0.01, MEAN_RADIUS, "length")  # pyright: ignore[reportArgumentType]
+        sins_rkcns(1.0, 0.01, MEAN_RADIUS, 3, "length")  # pyright: ignore[reportArgumentType]

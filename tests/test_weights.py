@@ -13,6 +13,7 @@ from jaxnav.estimation.banks.imm import uniform_switching
 from jaxnav.estimation.banks.log_weights import normalise, uniform
 from jaxnav.estimation.banks.mixture import mixture_info, moment_match
 from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import (
     Penalty,
     bayes,
@@ -25,7 +26,7 @@ from jaxnav.estimation.banks.weights import (
     switch,
     switched,
 )
-from jaxnav.estimation.types import Flag, Gaussian, Info, WeightRule
+from jaxnav.estimation.types import Flag, Gaussian, Info
 
 MODELS = 3
 RESET = WindowedReset(jnp.array(20.0), jnp.array(0.9), jnp.array(0.05))

@@ -8,7 +8,7 @@ argument and is never closed over. So a bank is a ``vmap`` over parameters, a Mo
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from enum import IntFlag
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -143,6 +143,11 @@ class ChannelInfo(NamedTuple):
     used: Array
     refused: Array
 
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations ``(..., m)`` that the innovations should have."""
+        return jnp.sqrt(jnp.diagonal(self.innovation_cov, axis1=-2, axis2=-1))
+
 
 def difference(z: Array, z_pred: Array) -> Array:
     """Return ``z - z_pred``: the ``residual`` of values that just subtract."""
@@ -227,6 +232,19 @@ class Model(NamedTuple):
         have = ", ".join(names) or "not named"
         raise ValueError(f"the model has no channel {name!r}; its channels are {have}{hint}")
 
+    def width(self, told: int | None = None) -> int:
+        """Return the number of values of an observation; told, where channels have no names.
+
+        Raises:
+            ValueError: If it is neither told nor known, or what is told is not what is known.
+        """
+        known = sum(size for _, size in self.channels) or None
+        if told is None and known is None:
+            raise ValueError("the model's channels have no names; give their number, channels=m")
+        if told is not None and known is not None and told != known:
+            raise ValueError(f"channels is {told}; those of the model have {known} values")
+        return known or told or 0
+
     def stack(self, values: Mapping[str, Any], valid: Mapping[str, Any] | None = None) -> Obs:
         """Return the observations of some channels by name; the others are missing.
 
@@ -239,8 +257,10 @@ class Model(NamedTuple):
             ValueError: If a name is unknown, a measurement has not its channel's size, leading axes
                 differ, or there is no measurement.
         """
-        arrays = {name: jnp.asarray(value) for name, value in values.items()}
-        marks = {name: jnp.asarray(mark) for name, mark in (valid or {}).items()}
+        # What is NumPy's stays there until the end, so that a log's length compiles nothing.
+        lib: Any = jnp if any(isinstance(v, jax.Array) for v in values.values()) else np
+        arrays = {name: lib.asarray(value) for name, value in values.items()}
+        marks = {name: lib.asarray(mark) for name, mark in (valid or {}).items()}
         leading = None
         for name, z in arrays.items():
             size = dict(self.channels).get(name) or self.channel(name)
@@ -261,15 +281,16 @@ class Model(NamedTuple):
                 raise ValueError(f"valid names channel {name!r}, which has no values")
         z, known = [], []
         for name, size in self.channels:
-            value = arrays.get(name, jnp.full((*leading, size), jnp.nan))
-            finite = jnp.isfinite(value)
+            value = arrays.get(name, lib.full((*leading, size), np.nan))
+            finite = lib.isfinite(value)
             if name in marks:
                 mark = marks[name]
                 wide = mark[..., None] if mark.ndim == len(leading) else mark
-                finite = jnp.broadcast_to(wide, value.shape)
-            z.append(jnp.where(finite, value, 0))
+                finite = lib.broadcast_to(wide, value.shape)
+            z.append(lib.where(finite, value, 0))
             known.append(finite)
-        return Obs(jnp.concatenate(z, axis=-1), jnp.concatenate(known, axis=-1))
+        both = lib.concatenate(z, axis=-1), lib.concatenate(known, axis=-1)
+        return Obs(*map(jnp.asarray, both))
 
     def part(self, info: Info, name: str) -> ChannelInfo:
         """Return what an update, or a record of updates, tells of one channel.
@@ -338,42 +359,6 @@ class Filter(NamedTuple):
     retract: Callable[[Point, Array], Point] = add
     local: Callable[[Point, Point], Array] = subtract
     check: Callable[[Params], None] = accept
-
-
-class WeightPredict(Protocol):
-    """Moves log-weights ``(M,)`` over a step, before its data: forgetting, switching."""
-
-    def __call__(self, params: Params, state: Any, log_weights: Array, k: Array) -> Array:
-        """Return normalised log-weights; ``k`` counts steps from 1."""
-        ...
-
-
-class WeightUpdate(Protocol):
-    """Moves log-weights ``(M,)`` with the members' :class:`Info` of the step."""
-
-    def __call__(
-        self, params: Params, state: Any, log_weights: Array, info: Info, k: Array
-    ) -> tuple[Any, Array]:
-        """Return the rule's state and normalised log-weights."""
-        ...
-
-
-class WeightRule(NamedTuple):
-    """How a bank weighs its members: itself a small filter over the model index.
-
-    A weight of ``-inf`` marks a member that takes no part; no rule revives it.
-
-    Attributes:
-        init: ``(params, log_weights) -> state``.
-        predict: See :class:`WeightPredict`; what it returns weighs the predictive likelihood.
-        update: See :class:`WeightUpdate`.
-        check: ``(params, M)`` raises ``ValueError``, as :attr:`Filter.check` does.
-    """
-
-    init: Callable[[Params, Array], Any]
-    predict: WeightPredict
-    update: WeightUpdate
-    check: Callable[[Params, int], None] = accept
 
 
 def observed(z: Array) -> Obs:

@@ -42,6 +42,11 @@ def matmul(A: Array, B: Array) -> Array:
     return product(A, B)
 
 
+def rotated_diagonal(C: Array, variances: Array) -> Array:
+    """Return ``C diag(variances) C'``, the covariance of independent errors seen in other axes."""
+    return matmul(C * variances[None], C.T)
+
+
 def materialised(tree: Any) -> Any:
     """Return small arrays as they are, computed once wherever they are used after.
 

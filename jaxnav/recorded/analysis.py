@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
@@ -12,7 +11,7 @@ from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Flag
 from jaxnav.findings import document_of, faults
-from jaxnav.navigation.models.vehicle import FIXES
+from jaxnav.navigation.models.vehicle import CONSTRAINTS, FIXES
 from jaxnav.recorded.audit import audit
 from jaxnav.recorded.config import FilterConfig, check, members
 from jaxnav.recorded.experiments import (
@@ -91,7 +90,8 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
     drive = prepare(log, config, config.rate_hz)
     chosen = method(config, drive.initial.mean.position)
     params, turned = _with_mounting(log, config, drive, chosen)
-    kept = run(chosen.filter, params, drive.inputs, drive.observations, record=chosen.record).record
+    seen = drive.seen_by(chosen.model)
+    kept = run(chosen.filter, params, drive.inputs, seen, record=chosen.record).record
     tell("filter", 1, 1)
     reference = None
     if log.reference is not None:
@@ -147,16 +147,15 @@ def _with_mounting(
         turned = np.array(config.mounting_deg) * DEG
     elif config.constraints:
         params = filter_params(config, drive, log.lever_arm, chosen.form)
-        known = np.asarray(drive.observations.valid)
-        known = np.where(np.arange(known.shape[1]) < FIXES.stop, known, False)
-        obs = drive.observations._replace(valid=jnp.asarray(known))
+        fixes = drive._replace(channels={name: drive.channels[name] for name in FIXES})
+        obs = fixes.seen_by(chosen.model)
         free = run(chosen.filter, params, drive.inputs, obs, record=chosen.record).record
         turned = mounting(free, drive)
     return filter_params(config, drive, log.lever_arm, chosen.form, turned), turned
 
 
 def _counts(log: DriveLog, drive: Drive) -> dict[str, Any]:
-    valid = np.asarray(drive.observations.valid)
+    constraints = [drive.channels[name].valid for name in CONSTRAINTS if name in drive.channels]
     return {
         "samples": len(log.imu.time_ns),
         "sample_s": log.imu.step_s,
@@ -175,7 +174,7 @@ def _counts(log: DriveLog, drive: Drive) -> dict[str, Any]:
         "period_s": float(np.median(np.asarray(drive.inputs.inertial.dt))),
         "longest_period_s": float(np.max(np.asarray(drive.inputs.inertial.dt))),
         "stopped_periods": int(np.sum(drive.stopped)),
-        "constraint_updates": int(np.sum(valid[:, FIXES.stop :].any(axis=1))),
+        "constraint_updates": int(sum(np.sum(held.any(axis=1)) for held in constraints)),
     }
 
 
@@ -202,12 +201,15 @@ def _offset(config: FilterConfig, offset: Offset | None) -> dict[str, Any]:
     return used if offset is None else used | {"sigma_s": offset.sigma_s}
 
 
-def _filter_scores(drive: Drive, kept: Kept, off: np.ndarray) -> dict[str, Any]:
+def _filter_scores(drive: Drive, kept: Kept, off: dict[str, np.ndarray]) -> dict[str, Any]:
     at = drive.fix_step
-    valid = np.asarray(drive.observations.valid)[at]
-    freedom, nis = valid.sum(axis=1), np.asarray(kept.nis)[at]
+    freedom = sum(seen.valid[at].sum(axis=1) for seen in drive.channels.values())
+    nis = np.asarray(kept.nis)[at]
     within = nis < chi2.ppf(NIS_CONFIDENCE, freedom)
-    innovation = np.where(valid[:, FIXES], np.asarray(kept.innovation)[at], np.nan)
+    innovation = {
+        name: np.where(drive.channels[name].valid[at], kept.parts[name].innovation[at], np.nan)
+        for name in FIXES
+    }
     return {
         "log_likelihood": float(np.sum(np.asarray(kept.log_likelihood))),
         "nis_per_channel": float(np.sum(nis) / np.sum(freedom)),
@@ -219,12 +221,15 @@ def _filter_scores(drive: Drive, kept: Kept, off: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _east_north_up(values: np.ndarray) -> dict[str, Any]:
-    """Return the RMS of the receiver's channels ``(F, 6)``."""
-    names = ("east", "north", "up")
-    velocity = {name: rms(values[:, i]) for i, name in enumerate(names)}
-    position = {name: rms(values[:, 3 + i]) for i, name in enumerate(names)}
-    return {"velocity": {**velocity, "unit": "m/s"}, "position": {**position, "unit": "m"}}
+def _east_north_up(values: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return the RMS of each of the receiver's channels, ``(F, 3)``."""
+    return {
+        name: {
+            **{axis: rms(values[name][:, i]) for i, axis in enumerate(("east", "north", "up"))},
+            "unit": unit,
+        }
+        for name, unit in (("velocity", "m/s"), ("position", "m"))
+    }
 
 
 def _reference_scores(errors: ReferenceErrors) -> dict[str, Any]:

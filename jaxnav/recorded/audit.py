@@ -13,6 +13,7 @@ import numpy as np
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Flag
 from jaxnav.findings import Finding, judged, memory_of, size_of
+from jaxnav.navigation.models.vehicle import CONSTRAINTS
 from jaxnav.numerics.masks import runs_of
 from jaxnav.recorded.methods import Kept
 from jaxnav.recorded.motion import course_velocity, since_start
@@ -199,7 +200,8 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
     ]
 
 
-_GROUPS = ("velocities", "positions", "constraints")
+_GROUPS = {"velocities": ("velocity",), "positions": ("position",), "constraints": CONSTRAINTS}
+"""What is judged together, by the channels of a vehicle."""
 
 
 def _constraints(value: float) -> Finding:
@@ -215,18 +217,20 @@ def _constraints(value: float) -> Finding:
 def _innovations(drive: Drive, kept: Kept) -> list[Finding]:
     """Judge the run's innovations: their size, their memory, what was refused."""
     findings = []
-    nis, channels = np.asarray(kept.group_nis), np.asarray(kept.channels)
-    for i, group in enumerate(_GROUPS):
-        total = int(channels[:, i].sum())
-        value = float(nis[:, i].sum()) / total if total > 30 else math.nan
+    for group, names in _GROUPS.items():
+        parts = [kept.parts[name] for name in names if name in kept.parts]
+        total = sum(int(np.sum(part.used)) for part in parts)
+        nis = sum(float(np.sum(part.nis)) for part in parts)
+        value = nis / total if total > 30 else math.nan
         if group == "constraints":
             findings.append(_constraints(value))
             continue
         findings.append(size_of(group, value))
     at = drive.fix_step
-    white = (np.asarray(kept.innovation) / np.asarray(kept.innovation_sigma))[at]
-    for i, axes in enumerate((slice(0, 3), slice(3, 5))):
-        findings.append(memory_of(_GROUPS[i], white[channels[at, i] > 0][:, axes]))
+    for group, axes in (("velocities", slice(0, 3)), ("positions", slice(0, 2))):
+        part = kept.parts[_GROUPS[group][0]]
+        white = (np.asarray(part.innovation) / np.asarray(part.sigma))[at]
+        findings.append(memory_of(group, white[np.any(part.used[at], axis=1)][:, axes]))
     flags = np.asarray(kept.flags)[at]
     share = float(np.mean((flags & (Flag.REFUSED | Flag.REOPENED)) > 0)) if len(at) else math.nan
     findings.append(

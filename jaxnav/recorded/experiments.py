@@ -12,18 +12,19 @@ from jaxnav.compiling import compiled
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.banks.mixture import BankParams, panel
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import Penalty, bayes, chain, fixed, floor, penalty
 from jaxnav.estimation.filters.gated import Gated
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sage_husa import sage_husa
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, FilterParams, Obs, WeightRule, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Model, replicate
 from jaxnav.navigation.earth import WGS84, metres_per_radian
 from jaxnav.navigation.models.vehicle import FIXES, vehicle
 from jaxnav.navigation.states import SinsLevel, error_form
 from jaxnav.recorded.config import ALONE, FilterConfig
 from jaxnav.recorded.methods import Kept, Method, filter_params, sage_husa_params
-from jaxnav.recorded.preparation import Drive, prepare
+from jaxnav.recorded.preparation import Drive, Seen, prepare
 from jaxnav.recorded.scoring import MOUNTING_S, fix_errors, horizontal
 
 FREE_S = 5.0
@@ -113,17 +114,16 @@ def hide_and_score(
     at = drive.time[drive.fix_step]
     window = np.searchsorted(start, at, side="right") - 1
     hidden = (window >= 0) & (at < start[window] + config.outage_s)
-    valid = np.array(drive.observations.valid)
-    valid[drive.fix_step[hidden], FIXES] = False
-    masks = {"inertial": np.where(np.arange(valid.shape[1]) < FIXES.stop, valid, False)}
+    left = {name: drive.channels[name].without(drive.fix_step[hidden]) for name in FIXES}
+    drives = {"inertial": drive._replace(channels=left)}
     if config.constraints:
-        masks["constrained"] = valid
+        drives["constrained"] = drive._replace(channels={**drive.channels, **left})
     one = single_model(params)
     errors, runs = {}, {}
-    for name, mask in masks.items():
-        obs = drive.observations._replace(valid=jnp.asarray(mask))
+    for name, partly in drives.items():
+        obs = partly.seen_by(method.model)
         kept = run(method.filter, params, drive.inputs, obs, record=method.record).record
-        off = fix_errors(method.model, one, drive, kept.mean)[:, 3:]
+        off = fix_errors(method.model, one, drive, kept.mean)["position"]
         errors[name], runs[name] = horizontal(off)[hidden], kept
     in_window = window[hidden]
     last = np.flatnonzero(np.diff(in_window, append=-1) != 0)
@@ -176,12 +176,12 @@ def add_noise(log: DriveLog, config: FilterConfig) -> NoiseScores:
     weights: dict[str, np.ndarray] = {}
     names: dict[str, list[str]] = {}
     for own in panels.values():
-        mean, weight = _all_draws(own.filter, own.names, own.params, narrow, noise)
+        mean, weight = _all_draws(own, model, narrow, noise)
         for i, name in enumerate(own.names):
             x = jax.tree.map(lambda leaf, i=i: leaf[:, :, i], mean)
             off = np.stack([_off(model, one.model, narrow, x, k) for k in range(len(noise))])
             squares[name] = np.stack(
-                [np.mean(off[:, span == k, 3:5] ** 2, axis=1) for k in range(_spans(config))], 1
+                [np.mean(off[:, span == k, :2] ** 2, axis=1) for k in range(_spans(config))], 1
             )
             if name in own.banks:
                 weights[name], names[name] = np.asarray(weight)[0, :, i], own.members
@@ -204,7 +204,7 @@ def _until(drive: Drive, end: float) -> Drive:
     return drive._replace(
         time=drive.time[part],
         inputs=jax.tree.map(lambda leaf: leaf[part], drive.inputs),
-        observations=Obs(*(leaf[part, FIXES] for leaf in drive.observations)),
+        channels={name: Seen(*(leaf[part] for leaf in drive.channels[name])) for name in FIXES},
         fix_step=drive.fix_step[fixes],
         fix=drive.fix[fixes],
         stopped=drive.stopped[part],
@@ -276,7 +276,7 @@ def _adaptive_panel(model: Any, one: FilterParams, config: FilterConfig) -> _Pan
     given = {"sage-husa": (), "bank-floor": ((), jnp.array(1e-3)), "bank-penalty": Penalty()}
     params = BankParams(several, given, _priors(rules, {"sage-husa": 0}, count))
     members = [f"b {b:g}, Q x{q:g}" for b, q in grid]
-    base = sage_husa(ekf, model, channels=FIXES.stop, current=True)
+    base = sage_husa(ekf, model, current=True)
     return _Panel(panel(base, rules), params, tuple(rules), tuple(rules)[1:], members)
 
 
@@ -288,10 +288,10 @@ def _priors(rules: dict[str, WeightRule], alone: dict[str, int], count: int) -> 
 
 
 def _all_draws(
-    filter: Filter, names: tuple[str, ...], params: BankParams, drive: Drive, noise: np.ndarray
+    own: _Panel, model: Model, drive: Drive, noise: np.ndarray
 ) -> tuple[SinsLevel, Array]:
     """Return estimates ``(N, F, rules)`` and weights ``(N, F, rules, M)`` at the fixes."""
-    at = jnp.asarray(drive.fix_step)
+    at, filter, names = jnp.asarray(drive.fix_step), own.filter, own.names
 
     def record(state: Any, info: Any) -> tuple[Any, Array]:
         del info
@@ -300,22 +300,23 @@ def _all_draws(
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *means)
         return stacked, jnp.stack([jnp.exp(state.log_weights[name]) for name in names])
 
+    seen = drive.seen_by(model)
+
     def one(noise: Array) -> tuple[SinsLevel, Array]:
-        z = drive.observations.z.at[at, 3:].add(noise)
-        obs = drive.observations._replace(z=z)
-        kept = run(filter, params, drive.inputs, obs, record=record).record
+        obs = seen._replace(z=seen.z.at[at, model.channel("position")].add(noise))
+        kept = run(filter, own.params, drive.inputs, obs, record=record).record
         return jax.tree.map(lambda leaf: leaf[at], kept)
 
     return compiled(lambda noise: jax.lax.map(one, noise, batch_size=TILE))(jnp.asarray(noise))
 
 
 def _off(model: Any, params: Any, drive: Drive, mean: Any, draw: int) -> np.ndarray:
-    """Return the errors ``(F, 6)`` of one draw against the fixes as they were."""
+    """Return the errors ``(F, 3) [m]`` of one draw against the fixes as they were."""
     x = jax.tree.map(lambda leaf: leaf[draw], mean)
     at = jnp.asarray(drive.fix_step)
     thin = drive._replace(
         inputs=jax.tree.map(lambda leaf: leaf[at], drive.inputs),
-        observations=jax.tree.map(lambda leaf: leaf[at], drive.observations),
+        channels=jax.tree.map(lambda leaf: leaf[drive.fix_step], drive.channels),
         fix_step=np.arange(len(drive.fix_step)),
     )
-    return fix_errors(model, params, thin, x)
+    return fix_errors(model, params, thin, x)["position"]

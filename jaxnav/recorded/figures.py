@@ -8,7 +8,6 @@ from scipy.stats import chi2
 
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.navigation.earth import metres_per_radian
-from jaxnav.navigation.models.vehicle import FIXES
 from jaxnav.plotting import COLOURS, figure, plot_weights, shades
 from jaxnav.recorded.analysis import Report
 from jaxnav.recorded.experiments import NoiseScores, Outages
@@ -71,19 +70,19 @@ def _errors(report: Report, path: Path) -> Path:
     if report.reference is not None:
         return _reference_errors(report.reference, path)
     drive, kept = report.drive, report.kept
-    got = np.asarray(drive.observations.valid)[drive.fix_step][:, FIXES][:, 3:].all(axis=1)
-    at = drive.fix_step[got]
+    at = drive.fix_step[drive.arrived("position")]
     time = drive.time[at]
-    innovation, sigma = (np.asarray(leaf)[at] for leaf in (kept.innovation, kept.innovation_sigma))
+    innovation = np.asarray(kept.parts["position"].innovation)[at]
+    sigma = np.asarray(kept.parts["position"].sigma)[at]
     with figure(path, (8, 5.5)) as drawing:
         panels = drawing.subplots(3, 1, sharex=True)
         for i, (axes, name) in enumerate(zip(panels, _AXES, strict=True)):
-            bound = 3 * sigma[:, 3 + i]
+            bound = 3 * sigma[:, i]
             axes.fill_between(time, -bound, bound, color="0.85", lw=0, label="±3 sigma, expected")
             axes.plot(
-                time, innovation[:, 3 + i], ".", ms=2, color=COLOURS["filter"], label="difference"
+                time, innovation[:, i], ".", ms=2, color=COLOURS["filter"], label="difference"
             )
-            limit = 1.3 * np.percentile(np.maximum(bound, np.abs(innovation[:, 3 + i])), 99.5)
+            limit = 1.3 * np.percentile(np.maximum(bound, np.abs(innovation[:, i])), 99.5)
             axes.set_ylim(-limit, limit)
             axes.set_ylabel(f"{name} [m]")
             axes.margins(x=0)
@@ -119,7 +118,7 @@ def _reference_errors(errors: ReferenceErrors, path: Path) -> Path:
 def _nis(report: Report, path: Path) -> Path:
     drive, kept = report.drive, report.kept
     at = drive.fix_step
-    freedom = np.asarray(drive.observations.valid)[at].sum(axis=1)
+    freedom = sum(seen.valid[at].sum(axis=1) for seen in drive.channels.values())
     nis = np.asarray(kept.nis)[at] / np.maximum(freedom, 1)
     usual = int(np.median(freedom))
     bounds = chi2.ppf([0.025, 0.975], usual) / usual

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.estimation.banks.mixture import BankParams, bank
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import (
     Penalty,
     bayes,
@@ -23,35 +24,30 @@ from jaxnav.estimation.banks.weights import (
 )
 from jaxnav.estimation.filters.adaptive import innovation_adaptive
 from jaxnav.estimation.filters.gated import Gate, Gated, gated
-from jaxnav.estimation.filters.innovation import nis_of
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.robust import versoria
 from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.run import Recorder
 from jaxnav.estimation.types import (
+    ChannelInfo,
     Filter,
     FilterParams,
     Gaussian,
     Info,
     Model,
-    WeightRule,
     replicate,
 )
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
 from jaxnav.navigation.states import ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.recorded.config import FilterConfig, members
-from jaxnav.recorded.preparation import CHANNELS, Drive
+from jaxnav.recorded.preparation import Drive
 from jaxnav.units import DEG, GRAVITY
 
 ERRORS: dict[str, LevelError] = {"liekf": "left-invariant", "se23-ekf": "right-invariant"}
 NOISE_RANGE = (0.1, 1e6)
 """Variance over the nominal that a Sage-Husa filter may estimate: RTK to hundreds of metres."""
-
-
-RECEIVER = ((0, 1, 2), (3, 4, 5))
-"""The channels of a fix that a gate takes together: its velocity, its position."""
 
 
 class Method(NamedTuple):
@@ -79,24 +75,18 @@ class Kept(NamedTuple):
         mean: The state.
         sigma: ``(15,)`` standard deviations in additive errors.
         nis: Normalised innovation squared.
-        log_likelihood: Of the step.
-        group_nis: ``(3,)`` the same of velocities, positions and constraints alone.
-        channels: ``(3,)`` how many of each were used.
+        parts: By channel of the model, what the update told of it.
         flags: Sum of :class:`~jaxnav.estimation.types.Flag`.
-        innovation: ``(6,)`` of the receiver's channels.
-        innovation_sigma: ``(6,)`` what the filter expects.
+        log_likelihood: Of the step.
         weights: ``(M,)`` of the members of a bank; ``(0,)`` of a filter.
     """
 
     mean: SinsLevel
     sigma: Array
     nis: Array
-    group_nis: Array
-    channels: Array
+    parts: dict[str, ChannelInfo]
     flags: Array
     log_likelihood: Array
-    innovation: Array
-    innovation_sigma: Array
     weights: Array
 
 
@@ -126,50 +116,40 @@ def _method(
     """Return a method; another call finds it and with it the programs compiled for it."""
     origin = jnp.array(about)
     model = vehicle(error, origin, constrained=constrained)
-    channels = CHANNELS if constrained else FIXES.stop
-    one, form = member(name, model, channels), error_form(error, origin)
+    one, form = member(name, model), error_form(error, origin)
     chosen = one if weighed is None else bank(one, rule(weighed))
     if gate:
-        chosen = gated(chosen, RECEIVER)
+        chosen = gated(chosen, [indices(model, name) for name in FIXES])
 
     def record(state: Any, info: Info) -> Kept:
         estimate = chosen.estimate(state)
         own = state.inner if gate else state
         weights = jnp.zeros(0) if weighed is None else jnp.exp(own.log_weights)
-        seen = jnp.diag(info.innovation_cov)[FIXES]
-        group_nis, used = by_group(info)
         return Kept(
             estimate.mean,
             additive_sigma(form, estimate),
             info.nis,
-            group_nis,
-            used,
+            {name: model.part(info, name) for name, _ in model.channels},
             info.flags,
             info.log_likelihood,
-            info.innovation[FIXES],
-            jnp.sqrt(seen),
             weights,
         )
 
     return Method(chosen, model, form, record, weighed is not None)
 
 
-def by_group(info: Info) -> tuple[Array, Array]:
-    """Return the NIS of velocities, positions and constraints ``(3,)``, and channels of each."""
-    count = info.innovation.shape[0]
-    groups = (*RECEIVER, tuple(range(FIXES.stop, count)))
-    squares = [nis_of(info, group) if group else jnp.zeros(()) for group in groups]
-    # The innovation of a channel that was not used is exactly zero.
-    used = [jnp.sum(info.innovation[np.array(group, int)] != 0) for group in groups]
-    return jnp.stack(squares), jnp.stack(used).astype(jnp.int32)
+def indices(model: Model, name: str) -> range:
+    """Return the places of a channel in an observation."""
+    at = model.channel(name)
+    return range(at.start, at.stop)
 
 
-def member(name: str, model: Model, channels: int) -> Filter:
+def member(name: str, model: Model) -> Filter:
     """Return a single filter by its name."""
     builders: dict[str, Callable[[], Filter]] = {
         "ukf": lambda: ukf(model),
         "versoria-ekf": lambda: versoria(ekf, model),
-        "sage-husa-ekf": lambda: sage_husa(ekf, model, channels=channels),
+        "sage-husa-ekf": lambda: sage_husa(ekf, model),
         "iae": lambda: innovation_adaptive(ekf, model),
         **dict.fromkeys(("ekf", *ERRORS), lambda: ekf(model)),
     }

@@ -13,7 +13,7 @@ from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Filter, FilterParams, Info, Obs
-from jaxnav.navigation.models.vehicle import FIXES, vehicle
+from jaxnav.navigation.models.vehicle import vehicle
 from jaxnav.navigation.states import error_form
 from jaxnav.numerics.linalg import cholesky, solve_lower
 from jaxnav.recorded.config import ALONE, FilterConfig
@@ -61,7 +61,8 @@ def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
         DataError: If the search does not settle.
     """
     plain = replace(config, **ALONE)
-    filter = ekf(vehicle(constrained=False))
+    model = vehicle(constrained=False)
+    filter = ekf(model)
     value, sigma, step = _nearby(log, config.time_offset_s), float("nan"), 0.0
     for _ in range(STEPS):
         drive = prepare(log, replace(plain, time_offset_s=value), config.noise_rate_hz)
@@ -70,7 +71,7 @@ def likeliest_offset(log: DriveLog, config: FilterConfig) -> Offset:
         # Whole hundreds of periods, so that a start moved by one does not compile anew.
         whole = slice(len(drive.time) // 100 * 100 or None)
         inputs = jax.tree.map(lambda leaf, whole=whole: leaf[whole], drive.inputs)
-        obs = Obs(*(leaf[whole, FIXES] for leaf in drive.observations))
+        obs = Obs(*(leaf[whole] for leaf in drive.seen_by(model)))
         slope, information = _score(filter, params, inputs, obs)
         sigma = float(information) ** -0.5
         newton, limit = float(slope / information), LARGEST_STEP_S

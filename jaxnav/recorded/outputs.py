@@ -7,6 +7,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from jaxnav.navigation.models.vehicle import FIXES
 from jaxnav.recorded.methods import Kept
 from jaxnav.recorded.preparation import Drive
 from jaxnav.recorded.scoring import attitude_angles
@@ -100,10 +101,10 @@ def trajectory_arrays(drive: Drive, kept: Kept, members: list[str]) -> dict[str,
         "accel_bias": np.asarray(kept.mean.bias),
         "sigma": np.asarray(kept.sigma),
         "nis": np.asarray(kept.nis),
-        "channels": np.asarray(drive.observations.valid).sum(axis=1),
+        "channels": sum(obs.valid.sum(axis=1) for obs in drive.channels.values()),
         "stopped": drive.stopped,
-        "innovation": np.asarray(kept.innovation),
-        "innovation_sigma": np.asarray(kept.innovation_sigma),
+        "innovation": np.hstack([kept.parts[name].innovation for name in FIXES]),
+        "innovation_sigma": np.hstack([kept.parts[name].sigma for name in FIXES]),
         "fix_step": drive.fix_step,
     }
     if members:

@@ -1,5 +1,6 @@
 """From a recorded drive to what a filter takes: inputs, observations, the state at the start."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,19 +12,31 @@ from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.datasets.inertial import ImuLog
 from jaxnav.datasets.track import GnssTrack
-from jaxnav.estimation.types import Gaussian, Obs
+from jaxnav.estimation.types import Gaussian, Model, Obs
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput
-from jaxnav.navigation.models.vehicle import CONSTRAINTS, FIXES, REST, STEERED, VehicleInput
+from jaxnav.navigation.models.vehicle import VehicleInput
 from jaxnav.navigation.strapdown.increments import accumulate, increments_from_rates
 from jaxnav.recorded.config import FilterConfig
 from jaxnav.recorded.motion import seen_moving, since_start, still_samples, velocity_of
 from jaxnav.recorded.start import initial, start_of
 
-CHANNELS = FIXES.stop + len(CONSTRAINTS)
 FASTER = 1.5
 """How many times faster than its samples a filter may be asked to run: a rate told roughly."""
 BRIDGED_S = 60.0
 """Longest time without inertial samples that a filter is taken over."""
+
+
+class Seen(NamedTuple):
+    """What a channel saw at each period: values ``z`` ``(T, m)`` and which are ``valid``."""
+
+    z: np.ndarray
+    valid: np.ndarray
+
+    def without(self, steps: np.ndarray) -> "Seen":
+        """Return the same less what arrived in some periods."""
+        valid = np.array(self.valid)
+        valid[steps] = False
+        return self._replace(valid=valid)
 
 
 class Drive(NamedTuple):
@@ -32,7 +45,7 @@ class Drive(NamedTuple):
     Attributes:
         time: ``(T,) [s]`` ends of the periods since the first inertial sample.
         inputs: :class:`~jaxnav.navigation.models.vehicle.VehicleInput`, leading axis T.
-        observations: ``(T, 11)``: fixes and constraints where they hold.
+        channels: By name: the fixes, and the constraints where they hold.
         initial: State at the start, its covariance in additive errors.
         fix_step: ``(F,)`` period of each fix that is used.
         fix: ``(F,)`` its place in the log.
@@ -47,7 +60,7 @@ class Drive(NamedTuple):
 
     time: np.ndarray
     inputs: VehicleInput
-    observations: Obs
+    channels: Mapping[str, Seen]
     initial: Gaussian
     fix_step: np.ndarray
     fix: np.ndarray
@@ -58,6 +71,18 @@ class Drive(NamedTuple):
     stopped: np.ndarray
     bridged_s: float
     offset_s: float
+
+    def seen_by(self, model: Model) -> Obs:
+        """Return the observations ``(T, m)`` of a model: of its channels, those of the drive."""
+        names = [name for name, _ in model.channels if name in self.channels]
+        return model.stack(
+            {name: self.channels[name].z for name in names},
+            {name: self.channels[name].valid for name in names},
+        )
+
+    def arrived(self, name: str) -> np.ndarray:
+        """Return whether each fix ``(F,)`` has all values of one of the receiver's channels."""
+        return np.all(self.channels[name].valid[self.fix_step], axis=1)
 
 
 def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -> Drive:
@@ -118,7 +143,7 @@ def prepare(log: DriveLog, config: FilterConfig, rate_hz: float | None = None) -
             jnp.asarray(lag),
             jnp.asarray(grade),
         ),
-        observations=_observations(log.fixes, config, time[ends], step, fix, stopped),
+        channels=_channels(log.fixes, config, time[ends], step, fix, stopped),
         initial=initial(start, position_noise),
         fix_step=step,
         fix=fix,
@@ -183,21 +208,24 @@ def _condensed(gyro: Array, accel: Array, dt: Array, valid: Array, every: int) -
     return SinsGnssInput(turned, gain, turned / period[:, None], period)
 
 
-def _observations(
+def _channels(
     fixes: GnssTrack,
     config: FilterConfig,
     ends: np.ndarray,
     step: np.ndarray,
     fix: np.ndarray,
     stopped: np.ndarray,
-) -> Obs:
-    z, valid = np.zeros((len(ends), CHANNELS)), np.zeros((len(ends), CHANNELS), bool)
-    seen = np.hstack([velocity_of(fixes), fixes.geodetic])[fix]
-    known = np.isfinite(seen)
-    z[step, FIXES], valid[step, FIXES] = np.where(known, seen, 0), known
+) -> dict[str, Seen]:
+    found = {}
+    for name, values in (("velocity", velocity_of(fixes)), ("position", fixes.geodetic)):
+        z = np.full((len(ends), 3), np.nan)
+        z[step] = values[fix]
+        known = np.isfinite(z)
+        found[name] = Seen(np.where(known, z, 0), known)
     if config.constraints:
         ticks = np.floor(ends * config.steered_rate_hz)
         due = np.diff(ticks, prepend=ticks[0] - 1) > 0
-        valid[:, STEERED] = (due & ~stopped)[:, None]
-        valid[:, REST] = (due & stopped)[:, None]
-    return Obs(jnp.asarray(z), jnp.asarray(valid))
+        for name, size, held in (("steered", 2, due & ~stopped), ("rest", 3, due & stopped)):
+            zero = np.zeros((len(ends), size))
+            found[name] = Seen(zero, np.broadcast_to(held[:, None], zero.shape))
+    return found

@@ -56,11 +56,13 @@ class ReferenceErrors(NamedTuple):
     receiver_offset: np.ndarray
 
 
-def fix_errors(model: Model, params: VehicleParams, drive: Drive, mean: SinsLevel) -> np.ndarray:
-    """Return what the estimates are off from the fixes ``(F, 6)``: velocity [m/s], position [m].
+def fix_errors(
+    model: Model, params: VehicleParams, drive: Drive, mean: SinsLevel
+) -> dict[str, np.ndarray]:
+    """Return what the estimates are off from the fixes: "velocity" [m/s] and "position" [m].
 
-    East, north, up, computed minus measured, of the antenna at the time of the fix; NaN where the
-    fix has no entry.
+    Each ``(F, 3)``, east, north, up, computed minus measured, of the antenna at the time of the
+    fix; NaN where the fix has no entry.
 
     Args:
         model: The model.
@@ -69,16 +71,20 @@ def fix_errors(model: Model, params: VehicleParams, drive: Drive, mean: SinsLeve
         mean: Estimates, leading axis T.
     """
     at = jnp.asarray(drive.fix_step)
-    x, u, obs = jax.tree.map(lambda leaf: leaf[at], (mean, drive.inputs, drive.observations))
+    given = (mean, drive.inputs, drive.seen_by(model))
+    x, u, obs = jax.tree.map(lambda leaf: leaf[at], given)
     off = _against(model, params, x, u, obs.z)
-    known = np.asarray(obs.valid)[:, FIXES]
-    return np.where(known, np.asarray(off), np.nan)
+    known = {name: np.asarray(obs.valid)[:, model.channel(name)] for name in FIXES}
+    return {name: np.where(known[name], np.asarray(off[name]), np.nan) for name in FIXES}
 
 
 @compiled(static_argnums=0)
-def _against(model: Model, params: VehicleParams, x: SinsLevel, u: VehicleInput, z: Array) -> Array:
-    def one(x: SinsLevel, u: VehicleInput, z: Array) -> Array:
-        return -model.residual(z, model.observe(params, x, u))[FIXES]
+def _against(
+    model: Model, params: VehicleParams, x: SinsLevel, u: VehicleInput, z: Array
+) -> dict[str, Array]:
+    def one(x: SinsLevel, u: VehicleInput, z: Array) -> dict[str, Array]:
+        off = -model.residual(z, model.observe(params, x, u))
+        return {name: off[model.channel(name)] for name in FIXES}
 
     return jax.vmap(one)(x, u, z)
 
@@ -97,9 +103,8 @@ def diverged(kept: Kept, drive: Drive) -> bool:
     leaves = jax.tree.leaves((kept.mean, kept.sigma))
     if not all(np.isfinite(np.asarray(leaf)).all() for leaf in leaves):
         return True
-    got = np.asarray(drive.observations.valid)[drive.fix_step][:, FIXES][:, 3:].all(axis=1)
-    step = drive.fix_step[got]
-    far = horizontal(np.asarray(kept.innovation)[step][:, 3:]) > DIVERGED_M
+    step = drive.fix_step[drive.arrived("position")]
+    far = horizontal(np.asarray(kept.parts["position"].innovation)[step]) > DIVERGED_M
     lasted = (drive.time[step[end - 1]] - drive.time[step[begin]] for begin, end in runs_of(far))
     return any(seconds >= DIVERGED_S for seconds in lasted)
 

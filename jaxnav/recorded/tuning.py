@@ -16,7 +16,6 @@ from jaxnav.estimation.tune.losses import negative_log_likelihood
 from jaxnav.estimation.tune.transforms import POSITIVE, UNIT, between
 from jaxnav.estimation.types import Filter, Info, Obs
 from jaxnav.findings import Finding
-from jaxnav.navigation.models.vehicle import FIXES
 from jaxnav.recorded.audit import audit
 from jaxnav.recorded.config import FilterConfig, members
 from jaxnav.recorded.methods import filter_params, method
@@ -61,7 +60,7 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
             f"second half it must have at least {2 * LEAST_BLOCKS * BLOCK_S:.0f} s"
         )
     chosen = method(plain, drive.initial.mean.position, constrained=False)
-    whole = _whole(drive)
+    whole = Half(drive.inputs, drive.seen_by(chosen.model))
     first = jax.tree.map(lambda leaf: leaf[:half], whole)
     params_of = partial(_params, plain, drive, log, chosen.form)
     likelihood = compiled(partial(_blocks, chosen.filter, half, block))
@@ -106,11 +105,6 @@ def problem(log: DriveLog, config: FilterConfig) -> Problem:
             "fixes of a receiver depend on each other, which makes standard deviations too small",
         ),
     )
-
-
-def _whole(drive: Drive) -> Half:
-    observations = Obs(*(jnp.asarray(leaf)[:, FIXES] for leaf in drive.observations))
-    return Half(drive.inputs, observations)
 
 
 def _parameters(config: FilterConfig) -> dict[str, Parameter]:

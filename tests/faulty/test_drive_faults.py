@@ -198,7 +198,7 @@ def test_a_straight_start_leaves_the_mounting_alone(seconds: float) -> None:
     time = found.report.drive.time
     true = np.stack([np.interp(time, truth.time, v) for v in truth.velocity.T], axis=1)
     at = found.report.drive.fix_step
-    receiver = np.asarray(found.report.drive.observations.z)[at, :2] - true[at, :2]
+    receiver = np.asarray(found.report.drive.channels["velocity"].z)[at, :2] - true[at, :2]
     assert np.std(velocity[:, :2] - true[:, :2]) <= np.std(receiver)
 
 

@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxnav.estimation.banks.log_weights import active, member_log_likelihood, normalise
 from jaxnav.estimation.banks.reset import windowed_reset
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes, chain
 from jaxnav.estimation.checks import described, require_log_prior, require_members
 from jaxnav.estimation.types import (
@@ -22,7 +23,6 @@ from jaxnav.estimation.types import (
     Info,
     Input,
     Obs,
-    WeightRule,
     add,
     flags_of,
     subtract,

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.banks.log_weights import active, normalise, uniform
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes_step, stay
 from jaxnav.estimation.checks import POSITIVE, require_fields
-from jaxnav.estimation.types import Info, WeightRule
+from jaxnav.estimation.types import Info
 
 
 class WindowedReset(NamedTuple):

@@ -22,6 +22,7 @@ from jaxnav.estimation.banks.log_weights import (
     member_log_likelihood,
     normalise,
 )
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.checks import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -30,7 +31,7 @@ from jaxnav.estimation.checks import (
     require_number,
     require_transition_matrix,
 )
-from jaxnav.estimation.types import Flag, Info, WeightRule
+from jaxnav.estimation.types import Flag, Info
 
 
 def _stateless(params: Any, log_weights: Array) -> tuple[()]:

@@ -84,7 +84,7 @@ def sage_husa(
     build: Callable[[Model], Filter],
     model: Model,
     *,
-    channels: int,
+    channels: int | None = None,
     form: NoiseForm = "clamped",
     current: bool = False,
     smooth: bool = False,
@@ -109,7 +109,8 @@ def sage_husa(
     Args:
         build: The filter to make adaptive; any of this library that takes a model.
         model: The model.
-        channels: Number of channels ``m`` of the model's observation.
+        channels: Number of values ``m`` of the model's observation; of a model with named channels
+            it is known.
         form: The sample.
         current: Update with the noise that has seen the innovation of the step, as the paper does;
             the default is that of the step before. The info is that of the update: with
@@ -118,8 +119,8 @@ def sage_husa(
         smooth: Clamp by softplus functions, for gradients.
 
     Raises:
-        ValueError: If there is no such form, the residual one is asked to be ``current``, or the
-            model has noise that does not just add.
+        ValueError: If there is no such form, the residual one is asked to be ``current``, the
+            model has noise that does not just add, or ``channels`` is missing or not the model's.
 
     References:
         Sage and Husa (1969); Song et al. (2022), Sensors 22:5976, Eqs. (20)-(22).
@@ -131,7 +132,7 @@ def sage_husa(
     if current and form == "residual":
         raise ValueError("the residual form knows the noise only after the update: current is off")
     require_additive(model, "a filter that estimates measurement noise")
-    base = build(with_given_noise(model))
+    base, width = build(with_given_noise(model)), model.width(channels)
 
     def check(params: FilterParams) -> None:
         base.check(params)
@@ -142,7 +143,7 @@ def sage_husa(
 
     def init(params: FilterParams) -> SageHusaState:
         dtype = params.initial.cov.dtype
-        unit, none = jnp.eye(channels, dtype=dtype), jnp.zeros((channels,), dtype)
+        unit, none = jnp.eye(width, dtype=dtype), jnp.zeros((width,), dtype)
         return SageHusaState(base.init(params), unit, none, jnp.zeros((), dtype))
 
     def predict(params: FilterParams, state: SageHusaState, u: Input) -> SageHusaState:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.models import Channel, Process, observing, shared
 from jaxnav.estimation.types import Model
 
 
@@ -55,4 +56,5 @@ def constant_velocity(axes: int) -> Model:
         del u
         return jnp.full(axes, params.position_sigma**2, x.dtype)
 
-    return Model(transition, process_noise, observe, observation_noise)
+    fix = Channel(axes, observe, observation_noise)
+    return observing(Process(transition, process_noise), {"position": fix}, parts=shared)

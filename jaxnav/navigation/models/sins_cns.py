@@ -18,13 +18,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.models import Process, observing, shared
 from jaxnav.estimation.types import Model
+from jaxnav.navigation.channels.star import misalignment
 from jaxnav.navigation.earth import gravity_gradient_launch_inertial
-from jaxnav.navigation.states import ATTITUDE_LAYOUT, LAYOUT
+from jaxnav.navigation.states import ATTITUDE_LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.launch_inertial import NavSolution
 from jaxnav.numerics.lie import skew
-from jaxnav.numerics.linalg import matmul
+from jaxnav.numerics.linalg import matmul, rotated_diagonal
 
 
 class SinsCnsParams(NamedTuple):
@@ -98,7 +100,8 @@ def sins_cns(period: float, imu_step: float) -> Model:
         imu_step: Interval of the inertial samples ``T_imu`` [s].
 
     Returns:
-        A linear model with :class:`SinsCnsParams` and :class:`SinsCnsInput`; three channels.
+        A linear model with :class:`SinsCnsParams` and :class:`SinsCnsInput`; one channel,
+        "attitude" ``(3,)``.
     """
 
     def transition(params: SinsCnsParams, x: Array, u: SinsCnsInput) -> Array:
@@ -114,11 +117,12 @@ def sins_cns(period: float, imu_step: float) -> Model:
     def process_noise(params: SinsCnsParams, x: Array, u: SinsCnsInput) -> Array:
         del x
         spread = params.noise_scale * period * imu_step
-        attitude = _rotated(u.dcm, spread * params.gyro_noise**2)
-        velocity = _rotated(u.dcm, spread * params.accel_noise**2)
+        attitude = rotated_diagonal(u.dcm, spread * params.gyro_noise**2)
+        velocity = rotated_diagonal(u.dcm, spread * params.accel_noise**2)
         return jnp.pad(attitude, ((0, 12), (0, 12))) + jnp.pad(velocity, ((3, 9), (3, 9)))
 
-    return Model(transition, process_noise, _observe, _observation_noise)
+    process = Process(transition, process_noise)
+    return observing(process, {"attitude": misalignment()}, parts=shared)
 
 
 def sins_cns_attitude(period: float, imu_step: float) -> Model:
@@ -132,21 +136,7 @@ def sins_cns_attitude(period: float, imu_step: float) -> Model:
     def process_noise(params: SinsCnsParams, x: Array, u: SinsCnsInput) -> Array:
         del x
         spread = params.noise_scale * period * imu_step
-        return jnp.pad(_rotated(u.dcm, spread * params.gyro_noise**2), ((0, 3), (0, 3)))
+        return jnp.pad(rotated_diagonal(u.dcm, spread * params.gyro_noise**2), ((0, 3), (0, 3)))
 
-    return Model(transition, process_noise, _observe, _observation_noise)
-
-
-def _rotated(C: Array, variances: Array) -> Array:
-    """Return ``C diag(variances) C'``."""
-    return matmul(C * variances[None], C.T)
-
-
-def _observe(params: SinsCnsParams, x: Array, u: SinsCnsInput) -> Array:
-    del params, u
-    return x[LAYOUT.phi]
-
-
-def _observation_noise(params: SinsCnsParams, x: Array, u: SinsCnsInput) -> Array:
-    del x, u
-    return params.star_noise**2
+    process = Process(transition, process_noise)
+    return observing(process, {"attitude": misalignment()}, parts=shared)

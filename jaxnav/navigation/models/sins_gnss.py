@@ -19,7 +19,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.models import Process, observing, shared
 from jaxnav.estimation.types import Model
+from jaxnav.navigation.channels.gnss import Antenna, receiver
 from jaxnav.navigation.earth import (
     WGS84,
     Earth,
@@ -27,19 +29,13 @@ from jaxnav.navigation.earth import (
     earth_rate,
     metres_per_radian,
     normal_gravity,
-    offset_between,
     transport_rate,
 )
-from jaxnav.navigation.sensors.gnss import antenna_motion
 from jaxnav.navigation.states import LAYOUT, ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.local_level import level_step
 from jaxnav.numerics.lie import skew, so3_exp, so3_left_jacobian
-from jaxnav.numerics.linalg import materialised, matmul
-
-CHANNELS = ("vel_e", "vel_n", "vel_u", "pos_e", "pos_n", "pos_u")
-"""Channels of the residual, in order; an observation has latitude, longitude, height in the last
-three places."""
+from jaxnav.numerics.linalg import materialised, matmul, rotated_diagonal
 
 
 class SinsGnssParams(NamedTuple):
@@ -84,14 +80,12 @@ class SinsGnssInput(NamedTuple):
 def sins_gnss(
     error: LevelError = "additive", origin: Array | None = None, earth: Earth = WGS84
 ) -> Model:
-    """Return the 15-state model, driven by the increments of one filter period.
+    """Return the process :func:`inertial` as a receiver sees it.
 
-        attitude, velocity, position by :func:`~jaxnav.navigation.strapdown.local_level.level_step`
-        with dtheta - T eps,  gain - T (nabla + eps x gain / 2)
-        Q = diag(N_g^2, N_a^2, 0, K_g^2, K_a^2) T  in body axes, turned into the error's
         z = (v + C (w x l) - w_ie x C l,  p + C l)
 
-    The residual of a position is in metres, of first order in the distance.
+    The residual of a position is in metres, of first order in the distance; what is observed is
+    latitude, longitude and height.
 
     Args:
         error: The definition of the error.
@@ -99,17 +93,46 @@ def sins_gnss(
         earth: The Earth.
 
     Returns:
-        A model with :class:`SinsGnssParams` and :class:`SinsGnssInput`, six channels
-        (:data:`CHANNELS`) and analytic Jacobians, in which terms that ``(w_ie + w_en) T`` makes
-        small next to others of the same block are left out, and so is how Earth rate and transport
-        rate change with position.
+        A model with :class:`SinsGnssParams` and :class:`SinsGnssInput`, the channels "velocity" and
+        "position" of :func:`~jaxnav.navigation.channels.gnss.receiver` and analytic Jacobians.
+
+    Raises:
+        ValueError: If the error is not a known one, or the right-invariant one has no origin.
+    """
+    form = level_form(error, origin, earth)
+    return observing(inertial(form, earth), receiver(antenna, form, earth), parts=shared)
+
+
+def antenna(params: SinsGnssParams, u: SinsGnssInput) -> Antenna:
+    """Return what the channels of a receiver read of the parameters and inputs."""
+    return Antenna(params.lever_arm, u.rate, params.velocity_noise, params.position_noise)
+
+
+def level_form(error: LevelError, origin: Array | None, earth: Earth) -> ErrorForm:
+    """Return a definition of the error by its name, refused if it turns about nothing.
 
     Raises:
         ValueError: If the error is not a known one, or the right-invariant one has no origin.
     """
     if error == "right-invariant" and origin is None:
         raise ValueError("the right-invariant error turns about an origin; give a position")
-    form = error_form(error, jnp.zeros(3) if origin is None else origin, earth)
+    return error_form(error, jnp.zeros(3) if origin is None else origin, earth)
+
+
+def inertial(form: ErrorForm, earth: Earth = WGS84) -> Process:
+    """Return the process of 15 states, driven by the increments of one filter period.
+
+        attitude, velocity, position by :func:`~jaxnav.navigation.strapdown.local_level.level_step`
+        with dtheta - T eps,  gain - T (nabla + eps x gain / 2)
+        Q = diag(N_g^2, N_a^2, 0, K_g^2, K_a^2) T  in body axes, turned into the error's
+
+    Its derivative leaves out terms that ``(w_ie + w_en) T`` makes small next to others of the same
+    block, and how Earth rate and transport rate change with position.
+
+    Args:
+        form: The definition of the error.
+        earth: The Earth.
+    """
 
     def transition(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> SinsLevel:
         del params
@@ -118,39 +141,15 @@ def sins_gnss(
     def process_noise(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
         return _process_noise(form, params, x, u)
 
-    def observe(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
-        turning = u.rate - x.drift - matmul(x.dcm.T, earth_rate(x.position[0], earth))
-        arm = params.lever_arm
-        moving = antenna_motion(x.dcm, x.velocity, x.position, turning, arm, earth)
-        return jnp.concatenate(moving)
-
-    def observation_noise(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Array:
-        del x, u
-        return jnp.concatenate([params.velocity_noise, params.position_noise]) ** 2
-
-    def residual(z: Array, z_pred: Array) -> Array:
-        return jnp.concatenate([z[:3] - z_pred[:3], offset_between(z_pred[3:], z[3:], earth)])
-
-    def jacobians(
+    def differential(
         params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput
-    ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    ) -> Callable[[Array], Array]:
+        del params
         ahead = _advanced(x, u, earth)
-        moved, seen = _transition_differential(x, ahead, u, earth), _seen(params, x, u)
-        return (
-            lambda dx: form.from_additive(ahead, moved(form.to_additive(x, dx))),
-            lambda dx: seen(form.to_additive(x, dx)),
-        )
+        moved = _transition_differential(x, ahead, u, earth)
+        return lambda dx: form.from_additive(ahead, moved(form.to_additive(x, dx)))
 
-    return Model(
-        transition,
-        process_noise,
-        observe,
-        observation_noise,
-        residual,
-        form.retract,
-        form.local,
-        jacobians,
-    )
+    return Process(transition, process_noise, form.retract, form.local, differential)
 
 
 def _length(u: SinsGnssInput) -> Array:
@@ -178,13 +177,9 @@ def _process_noise(
     form: ErrorForm, params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput
 ) -> Array:
     none = jnp.zeros((3, 3), x.bias.dtype)
-
-    def turned(sigma: Array) -> Array:
-        return matmul(x.dcm * (sigma**2)[None], x.dcm.T)
-
     blocks = [
-        turned(params.gyro_noise),
-        turned(params.accel_noise),
+        rotated_diagonal(x.dcm, params.gyro_noise**2),
+        rotated_diagonal(x.dcm, params.accel_noise**2),
         none,
         jnp.diag(params.gyro_walk**2),
         jnp.diag(params.accel_walk**2),
@@ -272,21 +267,3 @@ def _transition_differential(
         )
 
     return moved
-
-
-def _seen(params: SinsGnssParams, x: SinsLevel, u: SinsGnssInput) -> Callable[[Array], Array]:
-    """Return the derivative of the observation in additive errors as a function of ``(15,)``."""
-    s = LAYOUT
-    arm = matmul(x.dcm, params.lever_arm)
-    swung = matmul(x.dcm, jnp.cross(u.rate - x.drift, params.lever_arm))
-
-    def seen(d: Array) -> Array:
-        drifted = matmul(x.dcm, jnp.cross(d[s.eps], params.lever_arm))
-        return jnp.concatenate(
-            [
-                d[s.dv] + jnp.cross(d[s.phi], swung) - drifted,
-                d[s.dr] + jnp.cross(d[s.phi], arm),
-            ]
-        )
-
-    return seen

@@ -12,26 +12,19 @@ References:
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.models import Process, observing, shared
 from jaxnav.estimation.types import Model
+from jaxnav.navigation.channels.star import StarForm, tracker
 from jaxnav.navigation.earth import gravity_gradient_launch_inertial, gravity_launch_inertial
 from jaxnav.navigation.states import LAYOUT, SinsTotal, local_total, retract_total
-from jaxnav.numerics.lie import (
-    euler_error_from_rotation,
-    euler_from_dcm,
-    so3_exp,
-    so3_left_jacobian,
-    so3_local,
-    so3_log,
-    wrapped_angle,
-)
-from jaxnav.numerics.linalg import matmul
-
-StarForm = Literal["rotation-vector", "euler"]
+from jaxnav.numerics.lie import so3_exp, so3_left_jacobian
+from jaxnav.numerics.linalg import matmul, rotated_diagonal
 
 
 class SinsTotalParams(NamedTuple):
@@ -70,7 +63,27 @@ class SinsTotalInput(NamedTuple):
 def sins_total(
     period: float, imu_step: float, radius: Array | float, star: StarForm = "rotation-vector"
 ) -> Model:
-    """Return the 15-state model, driven by the increments of one filter period.
+    """Return the process :func:`inertial` as a star tracker sees it.
+
+    Args:
+        period: Filter period ``T`` [s].
+        imu_step: Interval of the inertial samples ``T_imu`` [s].
+        radius: Distance from the Earth's centre to the launch point [m].
+        star: How the attitude is observed (:func:`~jaxnav.navigation.channels.star.tracker`): as a
+            rotation vector, or as the angles of the paper.
+
+    Returns:
+        A model with :class:`SinsTotalParams` and :class:`SinsTotalInput`, one channel, "attitude"
+        ``(3,)``, and analytic Jacobians.
+
+    Raises:
+        ValueError: If ``star`` is neither.
+    """
+    return observing(inertial(period, imu_step, radius), {"attitude": tracker(star)}, parts=shared)
+
+
+def inertial(period: float, imu_step: float, radius: Array | float) -> Process:
+    """Return the process of 15 states, driven by the increments of one filter period.
 
         C+ = C exp([dtheta - T eps]x)
         v+ = v + C (dvel - T nabla - T/2 eps x dvel) + g(r + v T/2) T
@@ -84,20 +97,7 @@ def sins_total(
         period: Filter period ``T`` [s].
         imu_step: Interval of the inertial samples ``T_imu`` [s].
         radius: Distance from the Earth's centre to the launch point [m].
-        star: How the star tracker's attitude is observed: as the rotation vector of C_ib with the
-            residual ``log(C_z C_pred')``, which is linear in phi, or as pitch, yaw and roll with
-            the angles' differences wrapped to +-pi, as in the paper, which is not.
-
-    Returns:
-        A model with :class:`SinsTotalParams` and :class:`SinsTotalInput`, three channels and
-        analytic Jacobians.
-
-    Raises:
-        ValueError: If ``star`` is neither.
     """
-    if star not in _STAR:
-        raise ValueError(f"star is {star!r}; it must be one of {', '.join(_STAR)}")
-    observe, residual, noise, observed = _STAR[star]
 
     def transition(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> SinsTotal:
         pull = gravity_launch_inertial(x.position + 0.5 * period * x.velocity, radius)
@@ -113,8 +113,8 @@ def sins_total(
     def process_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
         del u
         spread = period * imu_step
-        attitude = _rotated(x.dcm, spread * params.gyro_noise**2)
-        velocity = _rotated(x.dcm, spread * params.accel_noise**2)
+        attitude = rotated_diagonal(x.dcm, spread * params.gyro_noise**2)
+        velocity = rotated_diagonal(x.dcm, spread * params.accel_noise**2)
         driven = params.bias_sigma**2 * -jnp.expm1(-2 * period / params.bias_time)
         bias = driven * jnp.eye(3, dtype=x.bias.dtype)
         return (
@@ -123,14 +123,8 @@ def sins_total(
             + jnp.pad(bias, ((12, 0), (12, 0)))
         )
 
-    def jacobians(
-        params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput
-    ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-        return _transition_differential(period, radius, params, x, u), observed(x)
-
-    return Model(
-        transition, process_noise, observe, noise, residual, retract_total, local_total, jacobians
-    )
+    differential = partial(_transition_differential, period, radius)
+    return Process(transition, process_noise, retract_total, local_total, differential)
 
 
 def _felt(period: float, x: SinsTotal, u: SinsTotalInput) -> Array:
@@ -169,48 +163,3 @@ def _transition_differential(
         )
 
     return moved
-
-
-def _rotated(C: Array, variances: Array) -> Array:
-    """Return ``C diag(variances) C'``."""
-    return matmul(C * variances[None], C.T)
-
-
-def _rotation_vector(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
-    del params, u
-    return so3_log(x.dcm)
-
-
-def _rotation_between(z: Array, z_pred: Array) -> Array:
-    return so3_local(so3_exp(z_pred), so3_exp(z))
-
-
-def _isotropic_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
-    del x, u
-    return params.star_noise**2
-
-
-def _attitude_part(x: SinsTotal) -> Callable[[Array], Array]:
-    del x
-    return lambda d: d[LAYOUT.phi]
-
-
-def _euler_angles(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
-    del params, u
-    return euler_from_dcm(x.dcm)
-
-
-def _euler_noise(params: SinsTotalParams, x: SinsTotal, u: SinsTotalInput) -> Array:
-    del u
-    return _rotated(euler_error_from_rotation(x.dcm), params.star_noise**2)
-
-
-def _euler_part(x: SinsTotal) -> Callable[[Array], Array]:
-    M = euler_error_from_rotation(x.dcm)
-    return lambda d: matmul(M, d[LAYOUT.phi])
-
-
-_STAR = {
-    "rotation-vector": (_rotation_vector, _rotation_between, _isotropic_noise, _attitude_part),
-    "euler": (_euler_angles, wrapped_angle, _euler_noise, _euler_part),
-}

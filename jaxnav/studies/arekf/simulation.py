@@ -8,11 +8,11 @@ from jax import Array
 
 from jaxnav.compiling import host
 from jaxnav.estimation.types import Gaussian, Obs, SureObs
+from jaxnav.navigation.channels.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.earth import earth_rate, normal_gravity
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.sense import Clock, sense_level
 from jaxnav.navigation.sensors.allan import allan_variance, cluster_sizes, slope_rule
-from jaxnav.navigation.sensors.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.sensors.imu import ImuErrors, corrupt
 from jaxnav.navigation.states import SinsLevel
 from jaxnav.navigation.trajectory.arc import ArcProfile, fly_arc

@@ -15,11 +15,12 @@ from jaxnav.datasets.rtklib import load_rtklib_pos
 from jaxnav.datasets.track import GnssTrack, gaps, intervals_s, thin
 from jaxnav.estimation.banks.mixture import BankParams, panel
 from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes, chain, fixed, floor, markov
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.metrics import root
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import FilterParams, Gaussian, Info, Obs, WeightRule, replicate
+from jaxnav.estimation.types import FilterParams, Gaussian, Info, Obs, replicate
 from jaxnav.findings import Finding, judged, memory_of, size_of
 from jaxnav.navigation.earth import enu_from_geodetic
 from jaxnav.navigation.models.kinematic import (

@@ -16,6 +16,7 @@ from jax import Array
 from jaxnav.compiling import host
 from jaxnav.estimation.banks.mixture import BankParams, PanelState, moment_match, panel
 from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes, chain, fixed, floor, markov
 from jaxnav.estimation.bounds import oracle
 from jaxnav.estimation.filters.kalman import kf
@@ -28,7 +29,6 @@ from jaxnav.estimation.types import (
     Gaussian,
     Model,
     SureObs,
-    WeightRule,
     replicate,
 )
 from jaxnav.navigation.models.sins_cns import SinsCnsInput, SinsCnsParams, sins_cns

@@ -8,6 +8,7 @@ from jax import Array
 
 from jaxnav.compiling import compiled, host
 from jaxnav.estimation.run import simulate
+from jaxnav.navigation.channels.star import observe_attitude
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_cns import (
     SinsCnsInput,
@@ -17,7 +18,6 @@ from jaxnav.navigation.models.sins_cns import (
 )
 from jaxnav.navigation.sense import imu_samples, initial_error
 from jaxnav.navigation.sensors.imu import ImuErrors
-from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.states import LAYOUT
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import rotation_compensated

@@ -13,13 +13,14 @@ from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.log_weights import active
 from jaxnav.estimation.banks.mixture import BankParams, bank, panel
 from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes, chain, markov
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood, rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE, UNIT, above
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, WeightRule, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, replicate
 from jaxnav.navigation.models.sins_cns import SinsCnsInput, sins_cns_attitude
 from jaxnav.navigation.states import ATTITUDE_LAYOUT, LAYOUT
 from jaxnav.studies.base import require_one_scenario

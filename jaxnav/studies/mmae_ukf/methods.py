@@ -17,6 +17,7 @@ from jaxnav.compiling import host
 from jaxnav.estimation.banks.imm import imm, imm_params, uniform_switching
 from jaxnav.estimation.banks.mixture import BankParams, moment_match, panel
 from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes, chain, fixed
 from jaxnav.estimation.bounds import oracle
 from jaxnav.estimation.filters.kalman import ekf
@@ -30,7 +31,6 @@ from jaxnav.estimation.types import (
     Gaussian,
     Model,
     SureObs,
-    WeightRule,
     replicate,
 )
 from jaxnav.navigation.models.sins_total import SinsTotalInput, StarForm, sins_total

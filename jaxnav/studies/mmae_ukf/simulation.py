@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.compiling import compiled, host
+from jaxnav.navigation.channels.star import observe_attitude
 from jaxnav.navigation.earth import meridian_radius
 from jaxnav.navigation.models.sins_total import SinsTotalInput, SinsTotalParams, StarForm
 from jaxnav.navigation.sense import imu_samples, initial_error, opposite_biases
 from jaxnav.navigation.sensors.imu import ImuErrors, markov_error
-from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.states import LAYOUT, SinsTotal, retract_total
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.increments import accumulate

@@ -13,13 +13,14 @@ from jax import Array
 from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, bank, panel
 from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes, chain
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.montecarlo import RunOutput, monte_carlo
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import rmse, step_means, weigh
 from jaxnav.estimation.tune.transforms import POSITIVE, above
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, WeightRule, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, SureObs, replicate
 from jaxnav.navigation.models.sins_total import SinsTotalInput
 from jaxnav.navigation.states import LAYOUT, SinsTotal
 from jaxnav.numerics.lie import so3_local

@@ -26,7 +26,15 @@ from jaxnav.navigation.models.sins_total import sins_total
 from jaxnav.navigation.states import LAYOUT, SinsTotal, local_total
 from jaxnav.numerics.lie import euler_from_dcm, wrapped_angle
 from jaxnav.studies.rkcns.config import RkcnsConfig
-from jaxnav.studies.rkcns.simulation import Run, Timing, World, fly_run, noise_of, timing_of
+from jaxnav.studies.rkcns.simulation import (
+    Run,
+    Timing,
+    World,
+    fly_run,
+    noise_of,
+    slots_of,
+    timing_of,
+)
 from jaxnav.units import ARCSEC
 
 METHODS = (
@@ -50,6 +58,7 @@ class Setup(NamedTuple):
     trials: int
     methods: tuple[str, ...]
     printed: bool
+    slots: int
 
 
 class Shared(NamedTuple):
@@ -102,7 +111,14 @@ def setup_of(
         methods: Which to run.
         printed: Iterate as the paper prints it.
     """
-    return Setup(timing_of(config), config.iterations, config.trials, tuple(methods), printed)
+    return Setup(
+        timing_of(config),
+        config.iterations,
+        config.trials,
+        tuple(methods),
+        printed,
+        slots_of(config),
+    )
 
 
 def shared_of(config: RkcnsConfig, world: World) -> Shared:
@@ -141,7 +157,7 @@ def filters(setup: Setup) -> dict[str, Filter]:
     """Return the filters by method."""
     timing = setup.timing
     given = (timing.period, timing.imu_step, MEAN_RADIUS)
-    heights, angles = sins_rkcns(*given), sins_rkcns(*given, ray="angle")
+    heights, angles = (sins_rkcns(*given, setup.slots, ray) for ray in ("height", "angle"))
     iterating = {"iterations": setup.iterations, "trials": setup.trials, "printed": setup.printed}
     return {
         "conventional": ckf(sins_total(*given)),

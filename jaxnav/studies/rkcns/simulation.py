@@ -13,14 +13,14 @@ from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, SureObs
 from jaxnav.navigation.atmosphere import RefractionTable, tabulate
+from jaxnav.navigation.channels.refraction import Camera, measure, pick, view
+from jaxnav.navigation.channels.star import observe_attitude
 from jaxnav.navigation.earth import MEAN_RADIUS
 from jaxnav.navigation.limb import seen_refraction
 from jaxnav.navigation.models.sins_rkcns import SinsRkcnsInput, observations
 from jaxnav.navigation.models.sins_total import SinsTotalInput, SinsTotalParams, sins_total
 from jaxnav.navigation.sense import imu_samples, initial_error, opposite_biases, true_states
 from jaxnav.navigation.sensors.imu import ImuErrors
-from jaxnav.navigation.sensors.refraction import Camera, measure, pick, view
-from jaxnav.navigation.sensors.star import observe_attitude
 from jaxnav.navigation.stars import StarCatalogue, brighter, dcm_launch_icrs, directions
 from jaxnav.navigation.states import LAYOUT, SinsTotal, retract_total
 from jaxnav.navigation.strapdown.increments import accumulate
@@ -181,6 +181,11 @@ def stars_of(config: RkcnsConfig) -> StarCatalogue:
     return brighter(catalogue, limit)
 
 
+def slots_of(config: RkcnsConfig) -> int:
+    """Return the number of places for stars in an observation."""
+    return max(config.stars, LEAST_SLOTS)
+
+
 def find_stars(config: RkcnsConfig, atmosphere: RefractionTable, positions: Array) -> Limb:
     """Choose the refracted stars at true positions ``(K, 3) [m]`` from the launch point.
 
@@ -193,7 +198,7 @@ def find_stars(config: RkcnsConfig, atmosphere: RefractionTable, positions: Arra
     )
     sky = jnp.asarray(directions(catalogue, config.year)) @ jnp.asarray(launch).T
     band = 1e3 * jnp.array(config.tangent_km)
-    slots = max(config.stars, LEAST_SLOTS)
+    slots = slots_of(config)
     limb = _choose(slots, atmosphere, sky, jnp.asarray(catalogue.magnitude), band, positions)
     return limb._replace(seen=limb.seen & (jnp.arange(slots) < config.stars)[None])
 

@@ -10,15 +10,16 @@ from jax import Array
 
 from jaxnav.compiling import host
 from jaxnav.estimation.banks.mixture import BankParams, PanelState, panel
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import Penalty, bayes, chain, fixed, floor, penalty
 from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
 from jaxnav.estimation.filters.sigma_point import ukf
 from jaxnav.estimation.metrics import nees
 from jaxnav.estimation.montecarlo import RunOutput
 from jaxnav.estimation.run import run
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, WeightRule, replicate
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, replicate
 from jaxnav.navigation.earth import displaced, offset_between
-from jaxnav.navigation.models.sins_gnss import CHANNELS, sins_gnss
+from jaxnav.navigation.models.sins_gnss import sins_gnss
 from jaxnav.navigation.sense import Clock
 from jaxnav.navigation.states import LAYOUT
 from jaxnav.studies.sage_husa.config import WINDOWS_S, SageHusaConfig
@@ -226,7 +227,7 @@ def _stacked(trees: list[Any]) -> Any:
 @cache
 def member_of() -> Filter:
     """Return the filter that all members are."""
-    return sage_husa(ukf, informed(sins_gnss()), channels=len(CHANNELS), current=True)
+    return sage_husa(ukf, informed(sins_gnss()), current=True)
 
 
 @cache

@@ -9,10 +9,10 @@ from jax import Array
 from jaxnav.compiling import host
 from jaxnav.estimation.models import adapted
 from jaxnav.estimation.types import Gaussian, Model, Obs, SureObs
+from jaxnav.navigation.channels.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.earth import displaced
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput, SinsGnssParams
 from jaxnav.navigation.sense import Clock, sense_level
-from jaxnav.navigation.sensors.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.states import SinsLevel
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.vehicle import VehicleProfile, drive, town_legs

@@ -12,6 +12,7 @@ from jax import Array, float0
 
 from jaxnav.compiling import compiled
 from jaxnav.estimation.banks.mixture import BankParams, rewatch
+from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import Floor, Penalty, chain, fixed, floor, penalty
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.filters.sage_husa import sage_husa
@@ -24,11 +25,10 @@ from jaxnav.estimation.types import (
     Gaussian,
     Info,
     SureObs,
-    WeightRule,
     replicate,
 )
 from jaxnav.navigation.earth import offset_between
-from jaxnav.navigation.models.sins_gnss import CHANNELS, sins_gnss
+from jaxnav.navigation.models.sins_gnss import sins_gnss
 from jaxnav.studies.base import require_one_scenario
 from jaxnav.studies.sage_husa.config import SCENARIOS, SageHusaConfig
 from jaxnav.studies.sage_husa.methods import (
@@ -151,7 +151,7 @@ def _draw(config: SageHusaConfig, world: World, key: Array, runs: int) -> Run:
 def _member(smooth: bool) -> Filter:
     """Return the Sage-Husa filter that a member is."""
     model = informed(sins_gnss())
-    return sage_husa(ekf, model, channels=len(CHANNELS), current=True, smooth=smooth)
+    return sage_husa(ekf, model, current=True, smooth=smooth)
 
 
 def _rule(smooth: bool) -> WeightRule:

@@ -1,15 +1,38 @@
-"""Star camera that looks past the limb: which stars it sees, and refracted by how much."""
+"""Star camera that looks past the limb: which stars it sees, and refracted by how much.
+
+A star at the limb is seen bent by the angle R. As heights, the atmosphere gives that at which a
+ray is bent by R, the geometry that at which it must have passed to reach the vehicle; their
+difference is the observation, which is zero. R, and with it its noise, is in both, inside a
+logarithm: taken for noise that adds, it leaves a bias of ``H (sigma / R)^2 / 2`` on every height.
+As angles, the observation is R itself, by the angle under which the star is seen from a position;
+its noise adds, but it is exponential in the position.
+
+References:
+    Shi, Chen, Wang (2023), Eqs. (32)-(42). The observation (39) is printed as additive noise on a
+    height; the noise here is on the angle, where it arises, and the geometry is exact.
+"""
 
 from enum import IntEnum
-from typing import NamedTuple
+from functools import partial
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.models import Channel
+from jaxnav.estimation.types import Input, NonAdditive, Params, Point
 from jaxnav.navigation.atmosphere import RefractionTable
 from jaxnav.navigation.earth import MEAN_RADIUS
-from jaxnav.navigation.limb import seen_refraction, separation
+from jaxnav.navigation.limb import (
+    HeightModel,
+    model_height,
+    ray_height,
+    seen_refraction,
+    separation,
+)
+
+RayForm = Literal["height", "angle"]
 
 
 class Camera(NamedTuple):
@@ -191,3 +214,78 @@ def measure(key: Array, angle: Array, noise: Array | float) -> Array:
         noise: Standard deviation of the white error [rad].
     """
     return angle + noise * jax.random.normal(key, angle.shape, angle.dtype)
+
+
+def limb_stars(stars: int, radius: float, form: RayForm = "height") -> Channel:
+    """Return the channel ``(stars,)`` of stars at the limb, for states in launch-inertial axes.
+
+    It reads ``atmosphere``, ``refraction_noise`` [rad] and ``density_sigma``, one relative error of
+    the atmosphere for all stars of an epoch, of its parameters, and ``star`` ``(stars, 3)``,
+    ``angle`` ``(stars,)`` and ``density`` of the inputs. In ``noisy`` the noise of angles and
+    density enters where it arises, ``(stars + 1,)``, in ``noise`` to first order.
+
+    Args:
+        stars: Number of stars.
+        radius: Distance from the Earth's centre to the launch point, and to sea level [m].
+        form: How refraction is observed, as differences of heights, whose values are zero, or as
+            angles.
+
+    Raises:
+        ValueError: If ``form`` is neither; in a run, if the input has another number of stars.
+    """
+    if form not in _RAYS:
+        raise ValueError(f"ray is {form!r}; it must be one of {', '.join(_RAYS)}")
+    rays = _RAYS[form]
+
+    def disturbed(params: Params, x: Point, v: Array, u: Input) -> Array:
+        centred = x.position + jnp.array([0.0, 1.0, 0.0], v.dtype) * radius
+        if u.star.shape != (stars, 3) or u.angle.shape != (stars,):
+            raise ValueError(
+                f"the input has stars {u.star.shape} and angles {u.angle.shape}; the model is made "
+                f"for {stars}"
+            )
+        scale = u.density * (1 + v[-1])
+        one = partial(rays, params.atmosphere, radius, centred, scale)
+        return jax.vmap(one)(_Ray(u.star, u.angle, v[:-1]))
+
+    def sources(params: Params, x: Point, u: Input) -> Array:
+        del x
+        angles = jnp.broadcast_to(params.refraction_noise**2, u.angle.shape)
+        return jnp.concatenate([angles, params.density_sigma[None] ** 2])
+
+    def noise(params: Params, x: Point, u: Input) -> Array:
+        variances = sources(params, x, u)
+        G = jax.jacfwd(lambda v: disturbed(params, x, v, u))(jnp.zeros_like(variances))
+        return (G * variances[None]) @ G.T
+
+    def observe(params: Params, x: Point, u: Input) -> Array:
+        return disturbed(params, x, jnp.zeros(stars + 1, x.position.dtype), u)
+
+    return Channel(stars, observe, noise, noisy=NonAdditive(disturbed, sources))
+
+
+class _Ray(NamedTuple):
+    """A star's direction ``(3,)``, its refraction angle as measured and the noise of that [rad]."""
+
+    star: Array
+    measured: Array
+    noise: Array
+
+
+def _height_difference(
+    atmosphere: HeightModel, radius: float, position: Array, density: Array, ray: _Ray
+) -> Array:
+    """Return the height of a ray by the atmosphere less that by the geometry [m]."""
+    angle = ray.measured - ray.noise
+    by_atmosphere = model_height(atmosphere, angle / density)
+    return by_atmosphere - ray_height(position, ray.star, angle, radius)
+
+
+def _angle(
+    atmosphere: RefractionTable, radius: float, position: Array, density: Array, ray: _Ray
+) -> Array:
+    """Return the angle that is measured [rad]."""
+    return seen_refraction(atmosphere, position, ray.star, density, radius).angle + ray.noise
+
+
+_RAYS = {"height": _height_difference, "angle": _angle}
