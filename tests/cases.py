@@ -82,10 +82,10 @@ def _singles(model: Model, channels: int, bent: Model) -> dict[str, Filter]:
         "iterated_ekf": iterated_ekf(bent),
         "iterated_ckf": iterated_ckf(bent),
         "modified_iterated_ckf": modified_iterated_ckf(bent),
-        "versoria": versoria(ekf, bent),
-        "correntropy": correntropy(ekf, bent, iterations=1),
-        "innovation_adaptive": innovation_adaptive(ekf, bent),
-        "sage_husa": sage_husa(ekf, bent, channels=channels),
+        "versoria": versoria(ekf(bent)),
+        "correntropy": correntropy(ekf(bent), iterations=1),
+        "innovation_adaptive": innovation_adaptive(ekf(bent)),
+        "sage_husa": sage_husa(ekf(bent), channels=channels),
     }
 
 
@@ -123,7 +123,7 @@ def cases(
     table = {
         name: Case(made, _plain(name, base), _plain(name, base)) for name, made in singles.items()
     }
-    moving = base._replace(adaptation=noise_adaptation(0.9, 5.0))
+    moving = base._replace(own=noise_adaptation(0.9, 5.0))
     table["sage_husa"] = table["sage_husa"]._replace(params=moving)
     alike = _members(base, 1.0, 1.0, 1.0)
     for name, (made, rule) in _banks(model, singles).items():

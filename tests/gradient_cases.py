@@ -42,21 +42,21 @@ def searched(v: Array) -> Search:
     return Search(v[0], v[1], temperature=v[2])
 
 
-UNSCENTED = (0.8,), lambda p, v: p._replace(sigma=unscented(2, alpha=v[0]))
-SEARCH = (0.7, 0.9, 0.5), lambda p, v: p._replace(search=searched(v))
+UNSCENTED = (0.8,), lambda p, v: p._replace(own=unscented(2, alpha=v[0]))
+SEARCH = (0.7, 0.9, 0.5), lambda p, v: p._replace(own=searched(v))
 OWN: dict[str, tuple[tuple[float, ...], Callable[[Any, Array], Any]]] = {
     "ukf": UNSCENTED,
     "square_root_ukf": UNSCENTED,
-    "iterated_ekf": ((0.9, 0.5), lambda p, v: p._replace(search=Search(1.0, v[0], 1e-4, v[1]))),
+    "iterated_ekf": ((0.9, 0.5), lambda p, v: p._replace(own=Search(1.0, v[0], 1e-4, v[1]))),
     "iterated_ckf": SEARCH,
     "modified_iterated_ckf": SEARCH,
-    "versoria": ((0.1, 2.0), lambda p, v: p._replace(kernel=Versoria(v[0], v[1]))),
-    "correntropy": ((3.0,), lambda p, v: p._replace(kernel=Correntropy(v[0]))),
+    "versoria": ((0.1, 2.0), lambda p, v: p._replace(own=Versoria(v[0], v[1]))),
+    "correntropy": ((3.0,), lambda p, v: p._replace(own=Correntropy(v[0]))),
     "innovation_adaptive": (
         (20.0,),
-        lambda p, v: p._replace(adaptation=Adaptation(v[0], 0.01, 1e2)),
+        lambda p, v: p._replace(own=Adaptation(v[0], 0.01, 1e2)),
     ),
-    "sage_husa": ((0.95, 5.0), lambda p, v: p._replace(adaptation=SageHusa(v[0], v[1], 0.1, 1e2))),
+    "sage_husa": ((0.95, 5.0), lambda p, v: p._replace(own=SageHusa(v[0], v[1], 0.1, 1e2))),
     "immae, smooth": (
         (5.0, 0.9, 0.05),
         lambda p, v: p._replace(rule=((), WindowedReset(v[0], v[1], v[2]))),
@@ -68,7 +68,7 @@ OWN: dict[str, tuple[tuple[float, ...], Callable[[Any, Array], Any]]] = {
     "imm": ((0.05,), lambda p, v: p._replace(rule=uniform_switching(3, v[0]))),
     "mmae of iterated_ckf": (
         (0.7, 0.9, 0.5),
-        lambda p, v: p._replace(members=p.members._replace(search=replicate(searched(v), 3))),
+        lambda p, v: p._replace(members=p.members._replace(own=replicate(searched(v), 3))),
     ),
 }
 """Parameters beside the noise, at which the gradient is taken, and how they enter."""

@@ -83,7 +83,7 @@ ABOVE = jnp.array([0.0, 0.0, 7e6])
 def centred(centre: Array) -> Array:
     """The likelihood of a step by the weight of the centre, of which the filter takes the root."""
     filter, params, _ = CASES["square_root_ukf"]
-    params = params._replace(sigma=SigmaRule(2**0.5, 0.25, centre))
+    params = params._replace(own=SigmaRule(2**0.5, 0.25, centre))
     state = filter.predict(params, filter.init(params), jnp.array(0.5))
     obs = Obs(jnp.ones(1), jnp.ones(1, bool))
     return filter.update(params, state, jnp.array(0.5), obs)[1].log_likelihood

@@ -67,7 +67,7 @@ def batch(prior: Gaussian, noise: Any = 1.0, **entries: Any) -> FilterParams:
     """Parameters for a batch of priors."""
     count = prior.cov.shape[0]
     factor = jnp.broadcast_to(jnp.asarray(noise, float), (count,))
-    return FilterParams(factor, prior, search=search(count, **entries))
+    return FilterParams(factor, prior, own=search(count, **entries))
 
 
 @cache
@@ -131,7 +131,7 @@ def run_linear(filter: Filter, dtype: Any) -> tuple[Gaussian, Info]:
     )
 
     def one(rule: Search) -> tuple[Gaussian, Info]:
-        return run(filter, FilterParams((), prior, search=rule), inputs, obs).record
+        return run(filter, FilterParams((), prior, own=rule), inputs, obs).record
 
     return jax.vmap(one)(rules)
 
@@ -364,7 +364,7 @@ def test_one_full_step_is_the_cubature_filter() -> None:
     one = iterated_ckf(RANGING, iterations=1, trials=0)
     for plain, spread, bound in ((ckf(RANGING), 1.0, 1e-11), (ekf(RANGING), FINE, 1e-5)):
         ours, info = updated(one, batch(prior, spread=spread), obs)
-        theirs, told = updated(plain, batch(prior), obs)
+        theirs, told = updated(plain, batch(prior)._replace(own=()), obs)
         np.testing.assert_allclose(ours.mean, theirs.mean, rtol=0, atol=bound)
         np.testing.assert_allclose(ours.cov, theirs.cov, rtol=0, atol=bound)
         np.testing.assert_allclose(info.log_likelihood, told.log_likelihood, rtol=100 * bound)
@@ -402,7 +402,7 @@ def test_on_a_manifold() -> None:
     """One full step is the ckf; many find the mode over rotation vectors at the prior."""
     prior, obs = attitudes()
     ours, _ = updated(iterated_ckf(ATTITUDE, iterations=1, trials=0), batch(prior), obs)
-    theirs, _ = updated(ckf(ATTITUDE), batch(prior), obs)
+    theirs, _ = updated(ckf(ATTITUDE), batch(prior)._replace(own=()), obs)
     np.testing.assert_allclose(ours.mean, theirs.mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(ours.cov, theirs.cov, rtol=0, atol=1e-12)
     L = np.linalg.cholesky(prior.cov[0])
@@ -694,7 +694,7 @@ def test_gradients_are_exact_and_finite(name: str) -> None:
 
     def outcome(a: Array, obs: Obs, cov: Array) -> Array:
         rule = Search(spread=a[3], step=a[4], temperature=a[5])
-        params = FilterParams(a[2], Gaussian(a[:2], cov), search=rule)
+        params = FilterParams(a[2], Gaussian(a[:2], cov), own=rule)
         state, info = filter.update(params, filter.init(params), jnp.zeros(()), obs)
         return jnp.append(filter.estimate(state).mean, info.log_likelihood)
 
@@ -722,7 +722,7 @@ def test_gradients_are_exact_and_finite(name: str) -> None:
 def test_search_of_the_parameters_equals_the_keyword() -> None:
     prior, obs = cases()
     rule = Search(spread=0.4, step=0.7, sufficient=0.3, temperature=0.2)
-    params = batch(prior)._replace(search=())
+    params = batch(prior)._replace(own=())
     expected, told = updated(iterated_ckf(RANGING, search=rule), params, obs)
     found, info = updated(SHORT["ckf"], batch(prior, **rule._asdict()), obs)
     np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12)
@@ -845,10 +845,10 @@ def test_bad_arguments_are_named() -> None:
         with pytest.raises(ValueError, match=r"iterations = 3, trials = -1; .* no negative number"):
             make(RANGING, trials=-1)
     prior, obs = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in cases())
-    for wrong, kind in ((0.5, "float"), (prior, "Gaussian")):
-        params = FilterParams(jnp.ones(()), prior, search=wrong)
+    for wrong, kind in ((0.5, "0.5"), (prior, "a Gaussian")):
+        params = FilterParams(jnp.ones(()), prior, own=wrong)
         filter = iterated_ekf(RANGING)
-        with pytest.raises(ValueError, match=f"search is a {kind}; it must be a Search, or"):
+        with pytest.raises(ValueError, match=f"own is {kind}; it must be Search"):
             filter.update(params, filter.init(params), jnp.zeros(()), obs)
 
 

@@ -39,7 +39,7 @@ STATIC = Model(
 
 def updated(filter: Filter, kernel: Any, prior: Gaussian, noise: Static, obs: Obs):
     """Estimate and info after one update of the prior."""
-    params = FilterParams(noise, prior, kernel=kernel)
+    params = FilterParams(noise, prior, own=kernel)
     state, info = filter.update(params, filter.init(params), jnp.zeros(()), obs)
     return filter.estimate(state), info
 
@@ -67,7 +67,7 @@ def test_update_equals_the_loop_of_reweighted_updates(kind: str, iterations: int
         Static(jnp.array(H), jnp.array(R)),
         Obs(jnp.array(z), jnp.array(valid)),
     )
-    filter = build(ekf, STATIC, iterations=iterations)
+    filter = build(ekf(STATIC), iterations=iterations)
     estimate, info = compiled(jax.vmap(partial(updated, filter)))(*given)
     plain = compiled(jax.vmap(partial(updated, ekf(STATIC))))(*given)[1]
     for k in range(count):
@@ -108,7 +108,7 @@ def test_fixed_point_is_the_least_of_the_criterion(kind: str) -> None:
     """Brute force: the criterion on a grid of estimates; z up to four sigma of it away."""
     build, kernel = ROBUST[kind]
     z, variance = np.linspace(0, 4, 9), 0.5
-    filter = build(ekf, STATIC)
+    filter = build(ekf(STATIC))
     prior, noise, obs = scalar(0.0, variance, z)
     kernels = jax.tree.map(lambda leaf: jnp.full(9, leaf), kernel)
     estimate, _ = compiled(jax.vmap(partial(updated, filter)))(kernels, prior, noise, obs)
@@ -137,7 +137,7 @@ def test_outlier_is_thrown_away_and_good_data_after_a_poor_prior_is_not(kind: st
     build = {"versoria": versoria, "correntropy": correntropy}[kind]
     # prior variance, measurement
     cases = scalar(0.0, np.array([0.25, 1.0, 1e4, 1e4]), np.array([100.0, 100.0, 80.0, -150.0]))
-    robust, _ = compiled(jax.vmap(partial(updated, build(ekf, STATIC)), (None, 0, 0, 0)))(
+    robust, _ = compiled(jax.vmap(partial(updated, build(ekf(STATIC))), (None, 0, 0, 0)))(
         (), *cases
     )
     plain, _ = compiled(jax.vmap(partial(updated, ekf(STATIC)), (None, 0, 0, 0)))((), *cases)
@@ -147,7 +147,7 @@ def test_outlier_is_thrown_away_and_good_data_after_a_poor_prior_is_not(kind: st
     assert np.all(np.asarray(robust.cov)[2:, 0, 0] < 1.001)
     # The second kernel of the class is its default.
     named = {"versoria": Versoria(), "correntropy": Correntropy()}[kind]
-    again, _ = compiled(jax.vmap(partial(updated, build(ekf, STATIC)), (None, 0, 0, 0)))(
+    again, _ = compiled(jax.vmap(partial(updated, build(ekf(STATIC))), (None, 0, 0, 0)))(
         named, *cases
     )
     np.testing.assert_array_equal(again.mean, robust.mean)
@@ -169,7 +169,7 @@ def test_gradients_by_the_kernel_are_right_also_at_a_zero_residual() -> None:
             (correntropy, Correntropy(theta[2])),
         ):
             estimate, _ = updated(
-                build(ekf, STATIC), kernel, prior, Static(jnp.eye(2), jnp.array(R)), obs
+                build(ekf(STATIC)), kernel, prior, Static(jnp.eye(2), jnp.array(R)), obs
             )
             total = total + direction @ estimate.mean + jnp.sum(estimate.cov)
         return total
@@ -209,13 +209,13 @@ def test_noise_that_does_not_add_is_refused() -> None:
     )
     for build in (versoria, correntropy):
         with pytest.raises(ValueError, match="noise that does not add"):
-            build(ekf, one)
+            build(ekf(one))
 
 
 def test_a_robust_update_needs_an_iteration() -> None:
     for build in (versoria, correntropy):
         with pytest.raises(ValueError, match="iterations is 0"):
-            build(ekf, STATIC, iterations=0)
+            build(ekf(STATIC), iterations=0)
 
 
 class Walk(NamedTuple):
@@ -289,11 +289,11 @@ def test_heavy_tails_cost_a_robust_filter_little() -> None:
     assert plain[0] > 2 * clean[0], "the plain filter fails the row"
     of = {}
     for build in (versoria, correntropy):
-        own, robust = ratio(build(ekf, MOVING))
+        own, robust = ratio(build(ekf(MOVING)))
         of[build] = own, robust
         assert np.all(robust < 1.2 * clean)
         assert np.all(own < 1.03 * clean), "what it costs where there is no outlier"
-    again = ratio(versoria(ukf, MOVING))
+    again = ratio(versoria(ukf(MOVING)))
     np.testing.assert_allclose(again, of[versoria], rtol=1e-9)
 
 
@@ -307,11 +307,11 @@ def test_adaptive_filter_equals_the_loop() -> None:
     model = Linear(
         same(PHI, (steps, 2, 2)), same(0.1 * Q, (steps, 2, 2)), np.eye(2), R, np.zeros(2), np.eye(2)
     )
-    filter = innovation_adaptive(ekf, MOVING)
+    filter = innovation_adaptive(ekf(MOVING))
 
     @compiled
     def one(memory: Array, low: Array, high: Array) -> tuple[Array, Array]:
-        params = FilterParams(TRUE, PRIOR, adaptation=Adaptation(memory, low, high))
+        params = FilterParams(TRUE, PRIOR, own=Adaptation(memory, low, high))
         return run(
             filter,
             params,
@@ -335,12 +335,10 @@ def test_adaptive_filter_finds_a_process_noise_off_by_ten_in_sigma() -> None:
     """Both ways, 32 runs: with a memory of 50 the mean log of the factor ends within 0.25 of it."""
     steps = 1200
     data = sample(7, 32, steps)
-    filter = innovation_adaptive(ekf, MOVING)
+    filter = innovation_adaptive(ekf(MOVING))
 
     def one(off: Array, z: Array) -> tuple[Array, Array]:
-        params = FilterParams(
-            TRUE._replace(q=TRUE.q * off), PRIOR, adaptation=Adaptation(50.0, 1e-3, 1e3)
-        )
+        params = FilterParams(TRUE._replace(q=TRUE.q * off), PRIOR, own=Adaptation(50.0, 1e-3, 1e3))
         return run(
             filter,
             params,
@@ -376,7 +374,7 @@ def test_gradient_of_a_run(kind: str) -> None:
         observation_noise=lambda p, x, u: p.r * jnp.eye(1),
     )
     adaptive = kind == "innovation_adaptive"
-    filter = innovation_adaptive(ekf, model) if adaptive else versoria(ekf, model)
+    filter = innovation_adaptive(ekf(model)) if adaptive else versoria(ekf(model))
     z = jnp.array(np.random.default_rng(8).normal(size=(12, 1))).at[6].mul(10)
     valid = jnp.ones((12, 1), bool).at[3].set(False)
 
@@ -384,8 +382,7 @@ def test_gradient_of_a_run(kind: str) -> None:
         params = FilterParams(
             Walk(jnp.exp(theta[0]), jnp.exp(theta[1])),
             Gaussian(jnp.zeros(1), jnp.eye(1)),
-            kernel=Versoria(theta[2], theta[3]),
-            adaptation=Adaptation(100 * theta[2], 0.01, 100.0),
+            Adaptation(100 * theta[2], 0.01, 100.0) if adaptive else Versoria(theta[2], theta[3]),
         )
         estimate, info = run(filter, params, jnp.zeros(12), Obs(z, valid)).record
         return jnp.sum(estimate.mean**2) - jnp.sum(info.log_likelihood)

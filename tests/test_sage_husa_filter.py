@@ -11,7 +11,6 @@ import pytest
 from jax import Array
 
 from jaxnav.compiling import compiled
-from jaxnav.estimation.filters.adaptive import Adaptation
 from jaxnav.estimation.filters.kalman import kf
 from jaxnav.estimation.filters.sage_husa import SageHusa, averaging, sage_husa
 from jaxnav.estimation.run import run
@@ -115,7 +114,7 @@ def members(temperature: float = 0.02) -> FilterParams:
     start = column(o.start for o in OWN.values())
     prior = Gaussian(jnp.zeros((size, 2)), start[:, None, None] * jnp.eye(2)[None])
     adaptation = SageHusa(*own, temperature=jnp.full(size, temperature))
-    return FilterParams(column(o.q for o in OWN.values()), prior, adaptation=adaptation)
+    return FilterParams(column(o.q for o in OWN.values()), prior, own=adaptation)
 
 
 FILTERS = {
@@ -132,7 +131,7 @@ LAGGED = ("clamped", "residual", "printed")
 
 def built(name: str) -> Filter:
     """The filter of a name about the Kalman filter."""
-    return sage_husa(kf, MODEL, channels=2, **FILTERS[name])
+    return sage_husa(kf(MODEL), channels=2, **FILTERS[name])
 
 
 @cache
@@ -216,7 +215,8 @@ def plain_run() -> tuple[Array, Array, Array]:
     i = NAMES.index("held")
     obs = Obs(jnp.array(DATA.z[i]), jnp.array(DATA.valid[i]))
     params = jax.tree.map(lambda leaf: leaf[i], members())
-    estimate, info = run(kf(MODEL), params, jnp.array(DATA.grade[i]), obs).record
+    grade = jnp.array(DATA.grade[i])
+    estimate, info = run(kf(MODEL), params._replace(own=()), grade, obs).record
     return estimate.mean, estimate.cov, info.log_likelihood
 
 
@@ -299,7 +299,7 @@ def long_run(name: str) -> Callable[..., tuple[Array, Array]]:
     filter = built(name)
 
     def one(own: SageHusa, obs: Obs) -> tuple[Array, Array]:
-        params = FilterParams(jnp.array(1.0), Gaussian(jnp.zeros(2), jnp.eye(2)), adaptation=own)
+        params = FilterParams(jnp.array(1.0), Gaussian(jnp.zeros(2), jnp.eye(2)), own=own)
         grade = jnp.ones(LONG)
         return run(filter, params, grade, obs, record=lambda s, i: (s.noise, i.flags)).record
 
@@ -349,7 +349,7 @@ def test_dtype_in_is_dtype_out(name: str) -> None:
     prior = Gaussian(jnp.zeros(2, jnp.float32), jnp.eye(2, dtype=jnp.float32))
     one = FilterParams(jnp.float32(1), prior)
     obs = Obs(jnp.zeros(2, jnp.float32), jnp.ones(2, bool))
-    arrays = jax.tree.map(jnp.float32, SageHusa(process=Adaptation()))
+    arrays = jax.tree.map(jnp.float32, SageHusa())
 
     def step(params: FilterParams, obs: Obs) -> tuple[Any, Any, Gaussian]:
         start = filter.predict(params, filter.init(params), jnp.float32(1))
@@ -357,7 +357,7 @@ def test_dtype_in_is_dtype_out(name: str) -> None:
         return state, info, filter.estimate(state)
 
     for own in (arrays, SageHusa(), ()):
-        shaped = jax.eval_shape(step, one._replace(adaptation=own), obs)
+        shaped = jax.eval_shape(step, one._replace(own=own), obs)
         for leaf in jax.tree.leaves(shaped):
             assert leaf.dtype in (jnp.float32, jnp.int32, jnp.bool_), leaf
 
@@ -376,8 +376,8 @@ def test_share_of_a_sample() -> None:
 def test_what_cannot_be_asked_is_refused() -> None:
     noisy = NonAdditive(lambda p, x, v, u: H @ x + v, lambda p, x, u: jnp.ones(2))
     with pytest.raises(ValueError, match="form is 'fading'; it must be one of clamped, residual"):
-        sage_husa(kf, MODEL, channels=2, form="fading")  # pyright: ignore[reportArgumentType]
+        sage_husa(kf(MODEL), channels=2, form="fading")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="noise that does not add; a filter that estimates"):
-        sage_husa(kf, MODEL._replace(noisy=noisy), channels=2)
+        sage_husa(kf(MODEL._replace(noisy=noisy)), channels=2)
     with pytest.raises(ValueError, match="current is off"):
-        sage_husa(kf, MODEL, channels=2, form="residual", current=True)
+        sage_husa(kf(MODEL), channels=2, form="residual", current=True)

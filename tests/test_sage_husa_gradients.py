@@ -53,11 +53,11 @@ def check_gradient(loss: Callable[[Array], Array], points: list[np.ndarray]) -> 
 
 def test_gradient_of_the_likelihood_by_forgetting() -> None:
     """Of the residual form, by process noise and prior count too, which may be infinite."""
-    filter, (grade, obs) = sage_husa(kf, SCALAR, channels=1, form="residual"), graded_data()
+    filter, (grade, obs) = sage_husa(kf(SCALAR), channels=1, form="residual"), graded_data()
 
     def loss(theta: Array) -> Array:
         own, q = SageHusa(theta[0], theta[1]), jnp.exp(theta[2])
-        params = START._replace(model=q, adaptation=own)
+        params = START._replace(model=q, own=own)
         return negative_log_likelihood(filter, params, grade, obs)
 
     check_gradient(loss, [np.array([0.9, 4.0, 0.1]), np.array([0.95, np.inf, 0.1])])
@@ -65,13 +65,13 @@ def test_gradient_of_the_likelihood_by_forgetting() -> None:
 
 def test_gradient_of_a_banks_likelihood_by_averaging_and_penalty() -> None:
     """Two members of the smooth form that differ in process noise and forgetting."""
-    filter = bank(sage_husa(kf, SCALAR, channels=1, smooth=True), penalty())
+    filter = bank(sage_husa(kf(SCALAR), channels=1, smooth=True), penalty())
     grade, obs = graded_data()
 
     def loss(theta: Array) -> Array:
         shared = (jnp.broadcast_to(theta[i], (2,)) for i in range(2, 6))
         alike = replicate(START, 2)
-        inner = alike._replace(model=jnp.array([0.3, 3.0]), adaptation=SageHusa(theta[:2], *shared))
+        inner = alike._replace(model=jnp.array([0.3, 3.0]), own=SageHusa(theta[:2], *shared))
         rule = Penalty(*(theta[i] for i in range(6, 11)))
         return negative_log_likelihood(filter, BankParams(inner, rule), grade, obs)
 
@@ -84,14 +84,19 @@ def test_process_noise_is_adapted_as_by_the_filter_that_does_only_that() -> None
     grade, obs = graded_data()
     process = Adaptation(jnp.array(4.0), jnp.array(0.1), jnp.array(50.0))
 
-    def adapted(filter: Filter, own: Any) -> tuple[Array, Array]:
+    def adapted(filter: Filter, own: Any, factor: Callable[[Any], Array]) -> tuple[Array, Array]:
         def kept(state: Any, info: Any) -> tuple[Array, Array]:
-            return state.log_factor, state.inner.x
+            return factor(state), filter.estimate(state).mean
 
-        return run(filter, START._replace(adaptation=own), grade, obs, record=kept).record
+        return run(filter, START._replace(own=own), grade, obs, record=kept).record
 
-    both = adapted(sage_husa(kf, SCALAR, channels=1), SageHusa(1.0, jnp.inf, process=process))
-    alone = adapted(innovation_adaptive(kf, SCALAR), process)
+    inner = innovation_adaptive(kf(SCALAR))
+    both = adapted(
+        sage_husa(inner, channels=1),
+        (SageHusa(1.0, jnp.inf), process),
+        lambda state: state.inner.log_factor,
+    )
+    alone = adapted(inner, process, lambda state: state.log_factor)
     for found, expected in zip(both, alone, strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
     assert np.ptp(alone[0]) > 0.5
@@ -100,10 +105,10 @@ def test_process_noise_is_adapted_as_by_the_filter_that_does_only_that() -> None
 def test_gradient_of_the_smooth_clamp_at_and_beyond_the_bounds() -> None:
     """By one datum of a state that is known, half of its square being told."""
     low, high, width = 1.0, 2.0, 0.1
-    filter = sage_husa(kf, SCALAR, channels=1, smooth=True)
+    filter = sage_husa(kf(SCALAR), channels=1, smooth=True)
     own = SageHusa(0.5, jnp.inf, low, high, width)
     prior = Gaussian(jnp.zeros(1), jnp.zeros((1, 1)))
-    params = FilterParams(jnp.array(0.0), prior, adaptation=own)
+    params = FilterParams(jnp.array(0.0), prior, own=own)
 
     def variance(z: Array) -> Array:
         obs = Obs(z[None], jnp.array([True]))

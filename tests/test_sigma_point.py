@@ -97,8 +97,8 @@ UKF, SQUARE_ROOT_UKF = ukf(VAN_DER_POL), square_root_ukf(VAN_DER_POL)
 )
 def test_rule_of_the_parameters_and_both_forms_agree(rule: SigmaRule) -> None:
     """Also with a negative centre, which is a downdate in the square-root form."""
-    plain, seen = filtered(UKF, PARAMS._replace(sigma=arrays(rule)))
-    rooted, seen_too = filtered(SQUARE_ROOT_UKF, PARAMS._replace(sigma=arrays(rule)))
+    plain, seen = filtered(UKF, PARAMS._replace(own=arrays(rule)))
+    rooted, seen_too = filtered(SQUARE_ROOT_UKF, PARAMS._replace(own=arrays(rule)))
     assert np.all(np.asarray(seen.flags) == 0)
     assert np.all(np.asarray(seen_too.flags) == 0)
     # weights of 1e6 leave ten digits
@@ -110,7 +110,7 @@ def test_rule_of_the_parameters_and_both_forms_agree(rule: SigmaRule) -> None:
 
 def test_rule_of_the_parameters_equals_the_keyword() -> None:
     static, _ = filtered(ukf(VAN_DER_POL, alpha=0.7, beta=1.0, kappa=0.5), PARAMS)
-    given, _ = filtered(UKF, PARAMS._replace(sigma=arrays(unscented(2, 0.7, 1.0, 0.5))))
+    given, _ = filtered(UKF, PARAMS._replace(own=arrays(unscented(2, 0.7, 1.0, 0.5))))
     default, _ = filtered(UKF, PARAMS)
     np.testing.assert_allclose(given.mean, static.mean, rtol=1e-13)
     np.testing.assert_allclose(given.cov, static.cov, rtol=1e-13)
@@ -121,7 +121,7 @@ def test_rule_of_the_parameters_equals_the_keyword() -> None:
 def test_gradient_by_alpha(filter: Filter) -> None:
     @compiled
     def loss(alpha: Array) -> Array:
-        params = PARAMS._replace(sigma=unscented(2, alpha=alpha))
+        params = PARAMS._replace(own=unscented(2, alpha=alpha))
         return negative_log_likelihood(filter, params, jnp.zeros(STEPS), OBS)
 
     numeric = (loss(jnp.array(0.8 + 1e-5)) - loss(jnp.array(0.8 - 1e-5))) / 2e-5

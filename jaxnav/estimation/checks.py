@@ -70,13 +70,25 @@ def require_observations(observations: Any) -> None:
         raise ValueError(f"observations.valid is of {valid.dtype}; it must be of bool")
 
 
-def require_filter_params(model: Model, params: Any) -> None:
-    """Raise ``ValueError`` unless parameters are those of a single filter of a model."""
+def require_filter_params(model: Model, params: Any, own: type | None = None) -> None:
+    """Raise ``ValueError`` unless parameters are those of a single filter of a model.
+
+    Args:
+        model: The model.
+        params: The parameters.
+        own: The class of the filter's own, if it has any.
+    """
+    require_single(params)
+    require_own(params.own, own)
+    require_prior(model, params.initial)
+
+
+def require_single(params: Any) -> None:
+    """Raise ``ValueError`` unless parameters are those of a single filter."""
     if not isinstance(params, FilterParams):
         raise ValueError(
             f"params is {described(params)}; a single filter takes FilterParams(model, initial)"
         )
-    require_prior(model, params.initial)
 
 
 def require_prior(model: Model, initial: Any) -> None:
@@ -225,25 +237,24 @@ def require_fields(name: str, value: Any, kind: type, domains: Mapping[str, Doma
         require_number(f"{field} of {kind.__name__}", getattr(value, field), *domain)
 
 
-def require_part(
-    params: FilterParams, part: str, kind: type, domains: Mapping[str, Domain]
-) -> None:
-    """Raise ``ValueError`` unless a part of a filter's parameters is its own, or ``()``.
+def require_own(own: Any, kind: type | None, domains: Mapping[str, Domain] | None = None) -> None:
+    """Raise ``ValueError`` unless what a filter is given as its own parameters is its own.
 
     Args:
-        params: The parameters.
-        part: A field of :class:`FilterParams`.
-        kind: The class that the filter takes there.
+        own: The parameters; ``()`` is what the filter was built with.
+        kind: The class that the filter takes; ``None`` if it has none of its own.
         domains: As for :func:`require_fields`.
     """
-    value = getattr(params, part)
-    if isinstance(value, kind):
-        require_fields(part, value, kind, domains)
-    elif type(value) is not tuple or value:
+    if type(own) is tuple and not own:
+        return
+    if kind is None:
+        raise ValueError(f"own is {described(own)}; this filter has no parameters of its own")
+    if not isinstance(own, kind):
         raise ValueError(
-            f"{part} is {described(value)}; it must be {kind.__name__}(...), or () for what the "
-            "filter was built with"
+            f"own is {described(own)}; it must be {kind.__name__}(...), or () for what the filter "
+            "was built with"
         )
+    require_fields("own", own, kind, domains or {})
 
 
 def require_transition_matrix(matrix: Any, count: int) -> None:

@@ -27,6 +27,7 @@ from jaxnav.estimation.types import (
     difference,
     subtract,
 )
+from jaxnav.numerics.roots import semidefinite_root
 
 PROCESS = "process"
 """What a model's parameters of its process go by; no channel can have this name."""
@@ -46,7 +47,7 @@ class Channel(NamedTuple):
             logarithm of a rotation makes the measurement live on a manifold.
         differential: ``(params, x, u) -> H``, the derivative of ``observe`` in the tangent space of
             ``x`` as a matrix ``(m, n)`` or a function of a tangent vector; ``None`` for an
-            automatic one.
+            automatic one. The columns of states that are carried are automatic in any case.
         noisy: The measurement with noise that does not just add, for filters that augment the state
             with it; ``noise`` is then its covariance in the values, to first order.
     """
@@ -55,7 +56,7 @@ class Channel(NamedTuple):
     observe: Callable[[Params, Point, Input], Array]
     noise: Callable[[Params, Point, Input], Array]
     residual: Callable[[Array, Array], Array] = difference
-    differential: Callable[[Params, Point, Input], LinearMap] | None = None
+    differential: Callable[[Params, Point, Input], LinearMap | None] | None = None
     noisy: NonAdditive | None = None
 
 
@@ -69,17 +70,22 @@ class Process(NamedTuple):
         local: ``(x, y) -> dx`` with ``retract(x, dx) == y``; the default subtracts.
         differential: ``(params, x, u) -> Phi``, the derivative of ``transition`` in tangent
             coordinates as a matrix ``(n, n)`` or a function; ``None`` for an automatic one.
+        carried: Name and size of each state that :func:`~jaxnav.estimation.carried.carrying` added.
     """
 
     transition: Callable[[Params, Point, Input], Point]
     noise: Callable[[Params, Point, Input], Array]
     retract: Callable[[Point, Array], Point] = add
     local: Callable[[Point, Point], Array] = subtract
-    differential: Callable[[Params, Point, Input], LinearMap] | None = None
+    differential: Callable[[Params, Point, Input], LinearMap | None] | None = None
+    carried: tuple[tuple[str, int], ...] = ()
 
 
 class ModelParams(NamedTuple):
-    """Parameters of a model of :func:`observing`: those of its process, and of each channel."""
+    """Parameters of a model of :func:`observing`: those of its process, and of each channel.
+
+    Where channels were added to a model, its own parameters stand for those of the process.
+    """
 
     process: Params
     channels: Mapping[str, Params]
@@ -112,11 +118,39 @@ def shared(params: Params, name: str) -> Params:
 _Part = TypeVar("_Part", Model, Process, Channel)
 
 
-def observing(process: Process, *channels: Mapping[str, Channel], parts: Parts = by_name) -> Model:
+def process_of(model: Model) -> Process:
+    """Return how a model's state moves, with the model's parameters."""
+    both = model.jacobians
+    return Process(
+        model.transition,
+        model.process_noise,
+        model.retract,
+        model.local,
+        both and (lambda params, x, u: both(params, x, u)[0]),
+        model.carried,
+    )
+
+
+def channel_of(model: Model) -> Channel:
+    """Return all that a model observes as one channel, with the model's parameters."""
+    both = model.jacobians
+    return Channel(
+        model.width(),
+        model.observe,
+        model.observation_noise,
+        model.residual,
+        both and (lambda params, x, u: both(params, x, u)[1]),
+        model.noisy,
+    )
+
+
+def observing(
+    process: Process | Model, *channels: Mapping[str, Channel], parts: Parts = by_name
+) -> Model:
     """Return the model of a process that is seen by channels, stacked in the order given.
 
     Args:
-        process: How the state moves.
+        process: How the state moves, or a model whose channels come first and go on as they are.
         *channels: What observes it, by name; no name twice.
         parts: ``(params, name) -> params`` of that channel, or of the process for
             :data:`PROCESS`. The default takes :class:`ModelParams`, :func:`shared` gives all of
@@ -127,12 +161,19 @@ def observing(process: Process, *channels: Mapping[str, Channel], parts: Parts =
         missing are automatic. Its observation noise is a diagonal if that of every channel is.
 
     Raises:
-        ValueError: If there is no channel, a name is used twice or is :data:`PROCESS`, or a size is
-            below one; in a run, if what a channel gives has not its size.
+        ValueError: If there is no channel, a name is used twice or is :data:`PROCESS`, a size is
+            below one, or the channels of a model have no names; in a run, if what a channel gives
+            has not its size.
     """
-    named = _merged(channels)
+    before: tuple[tuple[str, int], ...] = ()
+    blocks: dict[str, Channel] = {}
+    if isinstance(process, Model):
+        before, blocks[PROCESS] = process.channels, channel_of(process)
+        process = process_of(process)
+    named = _merged(channels, {name for name, _ in before})
+    blocks.update(named)
     laid_out, total = [], 0
-    for name, channel in named.items():
+    for name, channel in blocks.items():
         laid_out.append((name, channel, slice(total, total + channel.size)))
         total += channel.size
 
@@ -142,11 +183,12 @@ def observing(process: Process, *channels: Mapping[str, Channel], parts: Parts =
         )
 
     def noise(params: Params, x: Point, u: Input) -> Array:
-        blocks = [
-            _sized(name, c, c.noise(parts(params, name), x, u), covariance=True)
-            for name, c, _ in laid_out
-        ]
-        return _block_diagonal(blocks)
+        return _block_diagonal(
+            [
+                _sized(name, c, c.noise(parts(params, name), x, u), covariance=True)
+                for name, c, _ in laid_out
+            ]
+        )
 
     def residual(z: Array, z_pred: Array) -> Array:
         return _joined([c.residual(z[at], z_pred[at]) for _, c, at in laid_out])
@@ -160,19 +202,44 @@ def observing(process: Process, *channels: Mapping[str, Channel], parts: Parts =
             maps = lambda dx: _joined([one(dx) for one in each])  # noqa: E731
         return of_process, maps
 
-    given = (process, *named.values())
+    given = (process, *blocks.values())
     return Model(
         transition=lambda params, x, u: process.transition(parts(params, PROCESS), x, u),
         process_noise=lambda params, x, u: process.noise(parts(params, PROCESS), x, u),
         observe=stacked,
         observation_noise=noise,
-        residual=difference if all(c.residual is difference for c in named.values()) else residual,
+        residual=difference if all(c.residual is difference for c in blocks.values()) else residual,
         retract=process.retract,
         local=process.local,
         jacobians=jacobians if any(part.differential is not None for part in given) else None,
         noisy=_noisy(laid_out, parts),
-        channels=tuple((name, channel.size) for name, channel in named.items()),
+        channels=(*before, *((name, channel.size) for name, channel in named.items())),
+        carried=process.carried,
     )
+
+
+def measured(key: Array, channel: Channel, params: Params, states: Point, inputs: Input) -> Array:
+    """Return what a sensor reports along true states ``(T, m)``, with the noise of its channel.
+
+    Args:
+        key: Random key.
+        channel: The sensor.
+        params: Its parameters.
+        states: True states, leading axis ``T``.
+        inputs: Inputs of the steps, leading axis ``T``; ``None`` where the channel needs none.
+    """
+
+    def one(key: Array, x: Point, u: Input) -> Array:
+        noisy = channel.noisy or NonAdditive(
+            lambda params, x, v, u: channel.observe(params, x, u) + v, channel.noise
+        )
+        noise = noisy.noise(params, x, u)
+        white = jax.random.normal(key, noise.shape[:1], noise.dtype)
+        v = jnp.sqrt(noise) * white if noise.ndim == 1 else semidefinite_root(noise).factor @ white
+        return noisy.observe(params, x, v, u)
+
+    count = jax.tree.leaves(states)[0].shape[0]
+    return jax.vmap(one)(jax.random.split(key, count), states, inputs)
 
 
 def adapted(
@@ -214,13 +281,13 @@ _OF_PARAMETERS = {
 """Fields of models, processes and channels that take parameters, state and input."""
 
 
-def _merged(channels: tuple[Mapping[str, Channel], ...]) -> dict[str, Channel]:
+def _merged(channels: tuple[Mapping[str, Channel], ...], taken: set[str]) -> dict[str, Channel]:
     named: dict[str, Channel] = {}
     for several in channels:
         for name, channel in several.items():
             if not isinstance(channel, Channel):
                 raise ValueError(f"channel {name!r} is {type(channel).__name__}, not a Channel")
-            if name in named:
+            if name in named or name in taken:
                 raise ValueError(f"there are two channels {name!r}; each needs a name of its own")
             if name == PROCESS:
                 raise ValueError(f"a channel is named {PROCESS!r}, as the process itself")
@@ -261,18 +328,25 @@ def _block_diagonal(blocks: list[Array]) -> Array:
 def _differential(
     channel: Channel, process: Process, params: Params, x: Point, u: Input
 ) -> Differential:
-    """Return the derivative of a channel as a function, automatic if it has none of its own."""
-    if channel.differential is not None:
-        own = channel.differential(params, x, u)
+    """Return the derivative of a channel as a function, automatic where it has none of its own."""
+    own = None if channel.differential is None else channel.differential(params, x, u)
+    n = jax.eval_shape(process.local, x, x).shape[0]
+    carried = sum(size for _, size in process.carried)
+    first = 0 if own is None else n - carried
+    if own is not None and not carried:
         return own if callable(own) else partial(jnp.matmul, own)
     z = channel.observe(params, x, u)
-    n = jax.eval_shape(process.local, x, x).shape[0]
 
     def seen(dx: Array) -> Array:
-        return channel.residual(channel.observe(params, process.retract(x, dx), u), z)
+        moved = process.retract(x, jnp.concatenate([jnp.zeros(first, dx.dtype), dx]))
+        return channel.residual(channel.observe(params, moved, u), z)
 
-    H = jax.jacfwd(seen)(jnp.zeros(n, z.dtype))
-    return lambda dx: H @ dx
+    H = jax.jacfwd(seen)(jnp.zeros(n - first, z.dtype))
+    if own is None:
+        return lambda dx: H @ dx
+    # The carried columns of its own derivative, if it has them, would count twice.
+    known = own if callable(own) else partial(jnp.matmul, own)
+    return lambda dx: known(dx.at[first:].set(0)) + H @ dx[first:]
 
 
 def _noisy(laid_out: list[tuple[str, Channel, slice]], parts: Parts) -> NonAdditive | None:

@@ -200,6 +200,8 @@ class Model(NamedTuple):
             with it; ``observation_noise`` is then its covariance in the channels, to first order.
         channels: Name and size of each sensor's part of the observation, in order, as
             :func:`~jaxnav.estimation.models.observing` has them; ``()`` where they have no names.
+        carried: Name and size of each state that :func:`~jaxnav.estimation.carried.carrying` added;
+            the last coordinates of the tangent space, in order.
     """
 
     transition: Callable[[Params, Point, Input], Point]
@@ -214,6 +216,7 @@ class Model(NamedTuple):
     ) = None
     noisy: NonAdditive | None = None
     channels: tuple[tuple[str, int], ...] = ()
+    carried: tuple[tuple[str, int], ...] = ()
 
     def channel(self, name: str) -> slice:
         """Return where a channel is in an observation.
@@ -316,23 +319,15 @@ class FilterParams(NamedTuple):
     Attributes:
         model: The parameters of the :class:`Model`'s functions.
         initial: Mean and covariance at t0.
-        sigma: :class:`~jaxnav.numerics.sigma.SigmaRule` of a sigma-point filter; ``()`` is the rule
-            that the filter was built with.
-        search: :class:`~jaxnav.estimation.filters.iterated.Search` of an iterated filter; ``()`` is
-            the one that the filter was built with.
-        kernel: :class:`~jaxnav.estimation.filters.robust.Versoria` or
-            :class:`~jaxnav.estimation.filters.robust.Correntropy` of a robust filter; ``()`` is the
-            default of its class.
-        adaptation: :class:`~jaxnav.estimation.filters.adaptive.Adaptation` of an adaptive filter;
-            ``()`` is the default.
+        own: The filter's own: a :class:`~jaxnav.numerics.sigma.SigmaRule` of a sigma-point filter,
+            a :class:`~jaxnav.estimation.filters.iterated.Search` of an iterated one. Of a wrapper
+            it is ``(its own, the inner filter's own)``, or its own alone, which leaves the inner
+            filter's as they are. ``()`` is what the filter was built with.
     """
 
     model: Params
     initial: Gaussian
-    sigma: Any = ()
-    search: Any = ()
-    kernel: Any = ()
-    adaptation: Any = ()
+    own: Any = ()
 
 
 class Filter(NamedTuple):
@@ -349,6 +344,9 @@ class Filter(NamedTuple):
         local: That of the estimate's manifold, as in :class:`Model`.
         check: ``(params)`` raises ``ValueError`` for parameters that are not those of this filter:
             by their types and shapes, and by their values where these are concrete. A run asks it.
+        model: The model that it filters; of a bank, that of its members.
+        on: ``(model) -> Filter``, the same filter of another model, by which wrappers hand noise to
+            it; ``None`` for what is no single filter.
     """
 
     init: Callable[[Params], Any]
@@ -359,6 +357,8 @@ class Filter(NamedTuple):
     retract: Callable[[Point, Array], Point] = add
     local: Callable[[Point, Point], Array] = subtract
     check: Callable[[Params], None] = accept
+    model: Model | None = None
+    on: "Callable[[Model], Filter] | None" = None
 
 
 def observed(z: Array) -> Obs:

@@ -55,19 +55,23 @@ def _fall(xp: Any, rise: Any, temperature: Any, lapse: Any) -> tuple[Any, Any]:
 _LOG_DENSITIES = np.log(101325 / (_GAS_CONSTANT * 288.15)) - np.cumsum(
     np.append(0, _fall(np, np.diff(_BASES), _TEMPERATURES[:-1], _LAPSES[:-1])[0])
 )
+_PRESSURES = np.exp(_LOG_DENSITIES) * _GAS_CONSTANT * _TEMPERATURES
+
+
+def _in_layer(height: Array, *of: np.ndarray) -> tuple[Array, list[Array]]:
+    """Return the height's rise above the base of its layer, geopotential [m], and the layer's."""
+    geopotential = height * (_GEOPOTENTIAL_RADIUS / (_GEOPOTENTIAL_RADIUS + height))
+    layer = jnp.searchsorted(jnp.asarray(_BASES[1:]), geopotential, side="right")
+    base, *found = (jnp.asarray(values)[layer] for values in (_BASES, *of))
+    return geopotential - base, found
 
 
 def _log_density(height: Array | float) -> tuple[Array, Array]:
     """Return ln of the density in kg/m^3 and its derivative by height [1/m]."""
     height = jnp.asarray(height, float)
-    shrink = _GEOPOTENTIAL_RADIUS / (_GEOPOTENTIAL_RADIUS + height)
-    geopotential = height * shrink
-    layer = jnp.searchsorted(jnp.asarray(_BASES[1:]), geopotential, side="right")
-    base, lapse, temperature, log_base = (
-        jnp.asarray(of)[layer] for of in (_BASES, _LAPSES, _TEMPERATURES, _LOG_DENSITIES)
-    )
-    fall, rate = _fall(jnp, geopotential - base, temperature, lapse)
-    return log_base - fall, -rate * shrink**2
+    rise, (lapse, base, log_base) = _in_layer(height, _LAPSES, _TEMPERATURES, _LOG_DENSITIES)
+    fall, rate = _fall(jnp, rise, base, lapse)
+    return log_base - fall, -rate * (_GEOPOTENTIAL_RADIUS / (_GEOPOTENTIAL_RADIUS + height)) ** 2
 
 
 def density(height: Array | float) -> Array:
@@ -83,6 +87,54 @@ def density(height: Array | float) -> Array:
         US Standard Atmosphere 1976, Eqs. (18), (23), (33a), (33b), (42), Table 4.
     """
     return jnp.exp(_log_density(height)[0])
+
+
+def temperature(height: Array | float) -> Array:
+    """Return the molecular-scale temperature [K] of the US Standard Atmosphere 1976.
+
+    Args:
+        height: Geometric height [m], any shape.
+
+    References:
+        US Standard Atmosphere 1976, Eq. (23), Table 4.
+    """
+    rise, (lapse, base) = _in_layer(jnp.asarray(height, float), _LAPSES, _TEMPERATURES)
+    return base + lapse * rise
+
+
+def pressure(height: Array | float) -> Array:
+    """Return the pressure of air [Pa] of the US Standard Atmosphere 1976.
+
+    Args:
+        height: Geometric height [m], any shape.
+
+    References:
+        US Standard Atmosphere 1976, Eqs. (33a), (33b).
+    """
+    return density(height) * _GAS_CONSTANT * temperature(height)
+
+
+def pressure_height(pressure: Array | float) -> Array:
+    """Return the geometric height [m] at which the standard atmosphere has a pressure.
+
+    The inverse of :func:`pressure`, in closed form; NaN where the pressure is not positive.
+
+    Args:
+        pressure: Of the air [Pa], any shape.
+
+    References:
+        US Standard Atmosphere 1976, Eqs. (19), (33a), (33b).
+    """
+    pressure = jnp.asarray(pressure, float)
+    layer = jnp.searchsorted(-jnp.asarray(_PRESSURES[1:]), -pressure, side="right")
+    base, lapse, at_base, below = (
+        jnp.asarray(values)[layer] for values in (_BASES, _LAPSES, _TEMPERATURES, _PRESSURES)
+    )
+    depth = jnp.log(below / jnp.where(pressure > 0, pressure, jnp.nan)) / _GRAVITY_BY_GAS
+    sloping = lapse != 0
+    path = jnp.where(sloping, jnp.expm1(lapse * depth) / jnp.where(sloping, lapse, 1), depth)
+    geopotential = base + at_base * path
+    return geopotential * _GEOPOTENTIAL_RADIUS / (_GEOPOTENTIAL_RADIUS - geopotential)
 
 
 def apparent_height(

@@ -267,7 +267,7 @@ def _adaptive_panel(model: Any, one: FilterParams, config: FilterConfig) -> _Pan
         gyro_noise=root * several.model.inner.gyro_noise,
         accel_noise=root * several.model.inner.accel_noise,
     )
-    several = several._replace(model=several.model._replace(inner=inner), adaptation=own)
+    several = several._replace(model=several.model._replace(inner=inner), own=own)
     rules: dict[str, WeightRule] = {
         "sage-husa": fixed(),
         "bank-floor": chain(bayes(), floor()),
@@ -276,7 +276,7 @@ def _adaptive_panel(model: Any, one: FilterParams, config: FilterConfig) -> _Pan
     given = {"sage-husa": (), "bank-floor": ((), jnp.array(1e-3)), "bank-penalty": Penalty()}
     params = BankParams(several, given, _priors(rules, {"sage-husa": 0}, count))
     members = [f"b {b:g}, Q x{q:g}" for b, q in grid]
-    base = sage_husa(ekf, model, current=True)
+    base = sage_husa(ekf(model), current=True)
     return _Panel(panel(base, rules), params, tuple(rules), tuple(rules)[1:], members)
 
 

@@ -119,7 +119,7 @@ def _method(
     one, form = member(name, model), error_form(error, origin)
     chosen = one if weighed is None else bank(one, rule(weighed))
     if gate:
-        chosen = gated(chosen, [indices(model, name) for name in FIXES])
+        chosen = gated(chosen, FIXES)
 
     def record(state: Any, info: Info) -> Kept:
         estimate = chosen.estimate(state)
@@ -148,9 +148,9 @@ def member(name: str, model: Model) -> Filter:
     """Return a single filter by its name."""
     builders: dict[str, Callable[[], Filter]] = {
         "ukf": lambda: ukf(model),
-        "versoria-ekf": lambda: versoria(ekf, model),
-        "sage-husa-ekf": lambda: sage_husa(ekf, model),
-        "iae": lambda: innovation_adaptive(ekf, model),
+        "versoria-ekf": lambda: versoria(ekf(model)),
+        "sage-husa-ekf": lambda: sage_husa(ekf(model)),
+        "iae": lambda: innovation_adaptive(ekf(model)),
         **dict.fromkeys(("ekf", *ERRORS), lambda: ekf(model)),
     }
     return builders[name]()
@@ -216,7 +216,7 @@ def filter_params(
     form: ErrorForm,
     mounting: np.ndarray | None = None,
 ) -> FilterParams | BankParams | Gated:
-    """Return the parameters of the filter or bank of a configuration, and of its gate.
+    """Return the parameters of a configuration's filter or bank, behind its gate if it has one.
 
     Args:
         config: The configuration.
@@ -229,7 +229,9 @@ def filter_params(
     if not config.gate:
         return inner
     gate = Gate(jnp.array(config.gate_false_alarm), jnp.array(config.gate_patience))
-    return Gated(inner, gate)
+    if isinstance(inner, BankParams):
+        return Gated(inner, gate)
+    return inner._replace(own=(gate, inner.own))
 
 
 def _ungated(
@@ -244,14 +246,13 @@ def _ungated(
     cov = columns(form.from_additive, mean, drive.initial.cov)
     one = FilterParams(model_params(config, drive, lever_arm, mounting), Gaussian(mean, cov))
     if config.filter == "sage-husa-ekf":
-        one = one._replace(adaptation=sage_husa_params(jnp.array(config.forgetting[0])))
+        one = one._replace(own=sage_husa_params(jnp.array(config.forgetting[0])))
     if members(config) == 1:
         return _scaled(one, jnp.array(config.r_factors[0]), jnp.array(config.q_factors[0]))
     grid = jnp.array(grid_of(config))
     several = replicate(one, len(grid))
     if config.filter == "sage-husa-ekf":
-        own = several.adaptation._replace(forgetting=grid[:, 2])
-        several = several._replace(adaptation=own)
+        several = several._replace(own=several.own._replace(forgetting=grid[:, 2]))
     several = jax.vmap(_scaled)(several, grid[:, 0], grid[:, 1])
     period = float(np.median(np.asarray(drive.inputs.inertial.dt)))
     return BankParams(several, rule_params(config, period))

@@ -49,12 +49,19 @@ def flight() -> tuple[np.ndarray, np.ndarray]:
 TRUTH, Z = flight()
 
 
+def behind(params: Any, gate: Gate) -> Any:
+    """Return the parameters of a filter or bank with those of its gate."""
+    if isinstance(params, jn.BankParams):
+        return Gated(params, gate)
+    return params._replace(own=(gate, params.own))
+
+
 def ran(name: str, z: np.ndarray, gate: Gate | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return means ``(T, 4)`` and flags ``(T,)``."""
     numbers = jax.tree.map(jnp.asarray, gate or Gate())
     estimate, info = jn.run(
         GATES[name],
-        Gated(FILTERS[name][1], numbers),
+        behind(FILTERS[name][1], numbers),
         jnp.zeros((STEPS, 1)),
         jn.Obs(jnp.asarray(z), jnp.ones(z.shape, bool)),
     ).record
@@ -112,7 +119,7 @@ def test_patience_and_false_alarm_are_parameters() -> None:
 
     @compiled
     def score(patience: Any) -> Any:
-        params = Gated(PRIOR, Gate(patience=patience))
+        params = behind(PRIOR, Gate(patience=patience))
         obs = jn.Obs(jnp.asarray(z), jnp.ones(z.shape, bool))
         return jn.negative_log_likelihood(GATES["kf"], params, jnp.zeros((STEPS, 1)), obs)
 
@@ -123,15 +130,22 @@ def test_groups_are_apart_and_parameters_are_its_own() -> None:
     with pytest.raises(ValueError, match="a channel can be in one group only"):
         gated(FILTERS["kf"][0], ((0, 1), (1, 2)))
     obs = jn.Obs(jnp.asarray(Z), jnp.ones(Z.shape, bool))
-    with pytest.raises(ValueError, match=r"^params is a FilterParams; a gated filter takes Gated"):
-        jn.run(GATES["kf"], PRIOR, jnp.zeros((STEPS, 1)), obs)
+    with pytest.raises(ValueError, match=r"^params is a BankParams; a gated bank takes Gated"):
+        jn.run(GATES["bank"], BANK, jnp.zeros((STEPS, 1)), obs)
+    with pytest.raises(ValueError, match=r"^params is a Gated; a single filter takes FilterParams"):
+        jn.run(GATES["kf"], Gated(PRIOR), jnp.zeros((STEPS, 1)), obs)
+    for groups in ((), ((0,), ())):
+        with pytest.raises(ValueError, match="needs groups of one channel or more"):
+            gated(FILTERS["kf"][0], groups)
+    with pytest.raises(ValueError, match="the model has no channel 'position'"):
+        gated(FILTERS["kf"][0], ("position",))
 
 
 def test_the_gate_holds_in_32_bits() -> None:
     narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), PRIOR)
     z = jnp.asarray(Z, jnp.float32).at[50, 0].add(1.1e3)
     obs = jn.Obs(z, jnp.ones(z.shape, bool))
-    params = Gated(narrow, Gate(jnp.float32(1e-9), jnp.float32(5.0)))
+    params = behind(narrow, Gate(jnp.float32(1e-9), jnp.float32(5.0)))
     model = MODEL._replace(
         transition=lambda p, x, u: jnp.asarray(F, jnp.float32) @ x,
         process_noise=lambda p, x, u: jnp.asarray(Q, jnp.float32),
@@ -157,8 +171,8 @@ def test_channels_that_are_not_used_do_not_widen_the_gate(left_out: str) -> None
     inputs = jnp.array([1.0 if left_out == "infinite variance" else 0.0])
     gate = Gate(jnp.array(1e-3), jnp.array(5.0))
     alone = gated(jn.kf(fixed), ((0, 1),))
-    _, info = jn.run(alone, Gated(known, gate), inputs, obs).record
+    _, info = jn.run(alone, behind(known, gate), inputs, obs).record
     assert int(info.flags[0]) & Flag.REFUSED
     both = jn.Obs(jnp.array([[12**0.5, 0.0]]), jnp.ones((1, 2), bool))
-    _, info = jn.run(alone, Gated(known, gate), jnp.zeros(1), both).record
+    _, info = jn.run(alone, behind(known, gate), jnp.zeros(1), both).record
     assert not int(info.flags[0]) & Flag.REFUSED

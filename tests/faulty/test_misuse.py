@@ -50,8 +50,8 @@ def filtered(params: Any = ONE, z: Any = Z, filter: Any = KF, u: Any = U) -> Cal
     return lambda: jn.run(filter, params, u, z)
 
 
-def part(build: Callable[..., jn.Filter], **parts: Any) -> Callable[[], Any]:
-    return filtered(ONE._replace(**parts), filter=build(jn.ekf, MODEL))
+def part(wrap: Callable[..., jn.Filter], own: Any) -> Callable[[], Any]:
+    return filtered(ONE._replace(own=own), filter=wrap(jn.ekf(MODEL)))
 
 
 def study(run_one: Any = lambda key, shared: jn.RunOutput(0.0), key: Any = None, runs: Any = 2):
@@ -251,25 +251,25 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         r"^rule of a panel is a; it must be a mapping with a, b$",
     ),
     "a kernel as a number": (
-        part(jn.versoria, kernel=0.1),
-        r"^kernel is 0\.1; it must be Versoria\(\.\.\.\), or \(\)",
+        part(jn.versoria, 0.1),
+        r"^own is 0\.1; it must be Versoria\(\.\.\.\), or \(\)",
     ),
     "a negative kernel": (
-        part(jn.versoria, kernel=Versoria(width=-1.0)),
+        part(jn.versoria, Versoria(width=-1.0)),
         r"^width of Versoria is -1; it must be in \[0, inf\)$",
     ),
     "an adaptation of another filter": (
-        part(jn.innovation_adaptive, adaptation=SageHusa()),
-        r"^adaptation is a SageHusa; it must be Adaptation\(\.\.\.\), or \(\)",
+        part(jn.innovation_adaptive, SageHusa()),
+        r"^own is a SageHusa; it must be Adaptation\(\.\.\.\), or \(\)",
     ),
     "a memory below one": (
-        part(jn.innovation_adaptive, adaptation=Adaptation(memory=0.5)),
+        part(jn.innovation_adaptive, Adaptation(memory=0.5)),
         r"^memory of Adaptation is 0\.5; it must be in \[1, inf\)$",
     ),
     "a forgetting factor of 1.2": (
         lambda: jn.run(
-            jn.sage_husa(jn.ekf, MODEL, channels=2),
-            ONE._replace(adaptation=SageHusa(forgetting=1.2)),
+            jn.sage_husa(jn.ekf(MODEL), channels=2),
+            ONE._replace(own=SageHusa(forgetting=1.2)),
             U,
             Z,
         ),

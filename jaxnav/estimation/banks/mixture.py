@@ -137,7 +137,8 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
         members = jax.vmap(filter.restart, in_axes=(0, None))(state.members, given)
         return state._replace(members=members)
 
-    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
+    local, model = filter.local, filter.model
+    return Filter(init, predict, update, estimate, restart, filter.retract, local, check, model)
 
 
 # What the rules of a panel have in common is done for all of them at once: one body to compile.
@@ -198,7 +199,8 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
     def restart(state: BankState, given: Gaussian) -> BankState:
         return narrow(single.restart(wide_state(state), given))
 
-    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
+    local, model = filter.local, filter.model
+    return Filter(init, predict, update, estimate, restart, filter.retract, local, check, model)
 
 
 def require_bank_params(filter: Filter, params: Any) -> int:

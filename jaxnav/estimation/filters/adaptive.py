@@ -1,15 +1,21 @@
 """Adaptive filters: noise that is estimated from the innovations as they come."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import POSITIVE, require_part
-from jaxnav.estimation.filters.given_noise import given, with_given_noise
+from jaxnav.estimation.checks import POSITIVE
 from jaxnav.estimation.filters.innovation import heard_by
+from jaxnav.estimation.filters.wrapping import (
+    Builder,
+    given,
+    parted,
+    require_wrapper,
+    with_given_noise,
+    wrapped,
+)
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
 
 LARGEST_RATIO = 10.0
@@ -36,7 +42,7 @@ class Adaptation(NamedTuple):
     temperature: Array | float = 0.02
 
 
-ADAPTATION_DOMAINS = {
+_DOMAINS = {
     "memory": ("[1, inf)", 1.0, jnp.inf),
     "low": POSITIVE,
     "high": POSITIVE,
@@ -67,7 +73,7 @@ def softly_clamped(
 
 
 def innovation_adaptive(
-    build: Callable[[Model], Filter], model: Model, *, smooth: bool = False
+    filter: Filter | Builder, model: Model | None = None, *, smooth: bool = False
 ) -> Filter:
     """Return a filter that scales its process noise until its innovations are as large as expected.
 
@@ -77,39 +83,46 @@ def innovation_adaptive(
     filter is consistent, so that nothing drifts then; otherwise it is a step up the innovations'
     likelihood. The bound keeps one outlier from deciding; a thousandth of good data reach it.
     Without data the factor stays. Outliers that come often are taken for process noise. Parameters
-    are :class:`~jaxnav.estimation.types.FilterParams` with :class:`Adaptation` as ``adaptation``.
+    are :class:`~jaxnav.estimation.types.FilterParams` whose ``own`` is ``(Adaptation(...), the
+    filter's own)``, or the :class:`Adaptation` alone.
 
     One factor for the whole Q is what a few channels can tell; the full matrix ``K C K'`` of
     Mohamed and Schwarz is of their rank and loses the structure of the model. The ratio of traces
     that Ding et al. scale Q by is that of two small numbers where measurement noise dominates.
 
     Args:
-        build: The filter to make adaptive; any of this library that takes a model.
-        model: The model.
+        filter: The filter to make adaptive: any single one, wrapped or not.
+        model: Its model, where ``filter`` is what builds it, as it used to be.
         smooth: Bound ratio and factor by softplus functions, for gradients.
+
+    Raises:
+        ValueError: If the filter is a bank.
 
     References:
         Mehra (1972), IEEE Trans. Automatic Control 17(5); Mohamed and Schwarz (1999), Journal of
         Geodesy 73(4); Ding, Wang, Rizos, Kinlyside (2007), Journal of Navigation 60(3).
     """
-    base = build(with_given_noise(model))
+    inside = wrapped(filter, model, "innovation_adaptive")
+    own_model = inside.model
+    base = inside.on(with_given_noise(own_model))
 
     def check(params: FilterParams) -> None:
-        base.check(params)
-        require_part(params, "adaptation", Adaptation, ADAPTATION_DOMAINS)
+        base.check(require_wrapper(params, Adaptation(), _DOMAINS))
 
     def init(params: FilterParams) -> AdaptiveState:
-        return AdaptiveState(base.init(params), jnp.zeros((), params.initial.cov.dtype))
+        _, inner = parted(params, Adaptation())
+        return AdaptiveState(base.init(inner), jnp.zeros((), params.initial.cov.dtype))
 
     def predict(params: FilterParams, state: AdaptiveState, u: Input) -> AdaptiveState:
-        scaled = given(params, jnp.exp(state.log_factor), 0.0)
+        _, inner = parted(params, Adaptation())
+        scaled = given(inner, jnp.exp(state.log_factor), 0.0)
         return state._replace(inner=base.predict(scaled, state.inner, u))
 
     def update(
         params: FilterParams, state: AdaptiveState, u: Input, obs: Obs
     ) -> tuple[AdaptiveState, Info]:
-        own = Adaptation() if params.adaptation == () else params.adaptation
-        told = heard_by(model, params.model, base.estimate(state.inner).mean, u, obs)
+        own, params = parted(params, Adaptation())
+        told = heard_by(own_model, params.model, base.estimate(state.inner).mean, u, obs)
         inner, info = base.update(given(params, 1.0, told.noise), state.inner, u, told.obs)
         moved = moved_log_factor(own, state.log_factor, info, told.obs, smooth=smooth)
         return AdaptiveState(inner, moved), told.upon(info)
@@ -120,7 +133,18 @@ def innovation_adaptive(
     def restart(state: AdaptiveState, estimate: Gaussian) -> AdaptiveState:
         return state._replace(inner=base.restart(state.inner, estimate))
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
+    return Filter(
+        init,
+        predict,
+        update,
+        estimate,
+        restart,
+        own_model.retract,
+        own_model.local,
+        check,
+        own_model,
+        on=lambda other: innovation_adaptive(inside.on(other), smooth=smooth),
+    )
 
 
 def moved_log_factor(

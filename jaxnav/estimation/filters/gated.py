@@ -10,7 +10,8 @@ from jax import Array
 
 from jaxnav.estimation.checks import described, require_fields
 from jaxnav.estimation.filters.innovation import nis_of
-from jaxnav.estimation.types import Filter, Flag, Gaussian, Info, Input, Obs, Params
+from jaxnav.estimation.filters.wrapping import parted, require_wrapper
+from jaxnav.estimation.types import Filter, Flag, Gaussian, Info, Input, Model, Obs, Params
 
 
 class Gate(NamedTuple):
@@ -27,8 +28,11 @@ class Gate(NamedTuple):
     patience: Array | float = 5.0
 
 
+_DOMAINS = {"false_alarm": ("(0, 1)", 0.0, 1.0), "patience": ("(0, inf]", 0.0, jnp.inf)}
+
+
 class Gated(NamedTuple):
-    """Parameters of a filter behind a gate: its own, and those of the gate."""
+    """Parameters of a bank behind a gate: its own, and those of the gate."""
 
     inner: Params
     gate: Gate = Gate()
@@ -41,8 +45,10 @@ class GatedState(NamedTuple):
     refused: Array
 
 
-def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
-    """Return a filter or bank that refuses what is not to be believed; parameters :class:`Gated`.
+def gated(filter: Filter, groups: Sequence[str | Sequence[int]] | None = None) -> Filter:
+    """Return a filter or bank that refuses what is not to be believed.
+
+    Its own parameters are a :class:`Gate`; those of a gated bank are :class:`Gated`.
 
     A group of channels whose normalised innovation squared is less probable than the gate allows is
     left out of the update, with :attr:`Flag.REFUSED`. With every refusal in a row the gate opens,
@@ -55,50 +61,55 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
 
     Args:
         filter: What runs behind the gate.
-        groups: Channels of each group, which stand and fall together; a channel that is in none
-            always passes.
+        groups: What stands and falls together: channels of the model by name, or places in an
+            observation. What is in no group always passes. The default is each of the model's
+            channels, or all of an observation whose channels have no names.
 
     Raises:
-        ValueError: If a channel is in two groups; in a run, for parameters of another filter.
+        ValueError: If there is no group or an empty one, a channel is in two or is not the model's;
+            in a run, for parameters of another filter.
 
     References:
         Bar-Shalom, Li, Kirubarajan (2001), section 5.4, for the gate; to open it again is usual in
         flight software.
     """
-    members = [channel for group in groups for channel in group]
-    if len(set(members)) != len(members):
-        raise ValueError(f"groups is {list(groups)}; a channel can be in one group only")
+    places = _places(filter.model, groups)
+    single = filter.on is not None
 
-    def check(params: Gated) -> None:
+    def check(params: Any) -> None:
+        if single:
+            return filter.check(require_wrapper(params, Gate(), _DOMAINS))
         if not isinstance(params, Gated):
-            raise ValueError(f"params is {described(params)}; a gated filter takes Gated(inner)")
-        domains = {
-            "false_alarm": ("(0, 1)", 0.0, 1.0),
-            "patience": ("(0, inf]", 0.0, jnp.inf),
-        }
-        require_fields("gate", params.gate, Gate, domains)
-        filter.check(params.inner)
+            raise ValueError(f"params is {described(params)}; a gated bank takes Gated(inner)")
+        require_fields("gate", params.gate, Gate, _DOMAINS)
+        return filter.check(params.inner)
 
-    def init(params: Gated) -> GatedState:
-        return GatedState(filter.init(params.inner), jnp.zeros(len(groups), jnp.int32))
+    def split(params: Any) -> tuple[Gate, Params]:
+        return parted(params, Gate()) if single else (params.gate, params.inner)
 
-    def predict(params: Gated, state: GatedState, u: Input) -> GatedState:
-        return state._replace(inner=filter.predict(params.inner, state.inner, u))
+    def init(params: Params) -> GatedState:
+        count = 1 if places is None else len(places)
+        return GatedState(filter.init(split(params)[1]), jnp.zeros(count, jnp.int32))
 
-    def update(params: Gated, state: GatedState, u: Input, obs: Obs) -> tuple[GatedState, Info]:
-        plain = filter.update(params.inner, state.inner, u, obs)
-        squares = jnp.stack([nis_of(plain[1], group) for group in groups])
+    def predict(params: Params, state: GatedState, u: Input) -> GatedState:
+        return state._replace(inner=filter.predict(split(params)[1], state.inner, u))
+
+    def update(params: Params, state: GatedState, u: Input, obs: Obs) -> tuple[GatedState, Info]:
+        gate, own = split(params)
+        plain = filter.update(own, state.inner, u, obs)
         used = plain[1].used
-        count = jnp.stack([jnp.sum(used[np.array(group)]) for group in groups])
+        groups = [np.arange(used.shape[0])] if places is None else places
+        squares = jnp.stack([nis_of(plain[1], group) for group in groups])
+        count = jnp.stack([jnp.sum(used[group]) for group in groups])
         heard = count > 0
         dtype = squares.dtype
-        opened = jnp.exp(-state.refused.astype(dtype) / params.gate.patience)
-        improbable = _tail(squares, count) < params.gate.false_alarm
-        refuse = heard & (_tail(squares * opened, count) < params.gate.false_alarm)
+        opened = jnp.exp(-state.refused.astype(dtype) / gate.patience)
+        improbable = _tail(squares, count) < gate.false_alarm
+        refuse = heard & (_tail(squares * opened, count) < gate.false_alarm)
         reopened = heard & improbable & ~refuse
         channels = jnp.zeros(obs.valid.shape, bool)
         for i, group in enumerate(groups):
-            channels = channels.at[np.array(group)].set(refuse[i])
+            channels = channels.at[group].set(refuse[i])
         left = obs._replace(valid=obs.valid & ~channels)
         excess = jnp.max(jnp.where(reopened, 1 / opened, 1))
 
@@ -108,7 +119,7 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
             chosen = jax.tree.map(
                 lambda a, b: jnp.where(jnp.any(reopened), a, b), wider, state.inner
             )
-            return filter.update(params.inner, chosen, u, left)
+            return filter.update(own, chosen, u, left)
 
         inner, info = jax.lax.cond(jnp.any(refuse | reopened), again, lambda _: plain, None)
         raised = jnp.where(jnp.any(refuse), int(Flag.REFUSED), 0)
@@ -123,7 +134,44 @@ def gated(filter: Filter, groups: Sequence[Sequence[int]]) -> Filter:
     def restart(state: GatedState, given: Gaussian) -> GatedState:
         return state._replace(inner=filter.restart(state.inner, given))
 
-    return Filter(init, predict, update, estimate, restart, filter.retract, filter.local, check)
+    build = filter.on
+    on = build and (lambda model: gated(build(model), groups))
+    return Filter(
+        init,
+        predict,
+        update,
+        estimate,
+        restart,
+        filter.retract,
+        filter.local,
+        check,
+        filter.model,
+        on,
+    )
+
+
+def _places(
+    model: Model | None, groups: Sequence[str | Sequence[int]] | None
+) -> list[np.ndarray] | None:
+    """Return the places of each group in an observation, ``None`` for one group of all."""
+    if groups is None:
+        groups = [name for name, _ in model.channels] if model is not None else []
+        if not groups:
+            return None
+    if not groups or not all(len(group) for group in groups):
+        raise ValueError(f"groups is {list(groups)}; a gate needs groups of one channel or more")
+    places = []
+    for group in groups:
+        if isinstance(group, str):
+            if model is None:
+                raise ValueError(f"the filter has no model whose channel {group!r} could be meant")
+            at = model.channel(group)
+            group = range(at.start, at.stop)
+        places.append(np.array(list(group)))
+    every = np.concatenate(places)
+    if len(set(every.tolist())) != len(every):
+        raise ValueError(f"groups is {list(groups)}; a channel can be in one group only")
+    return places
 
 
 def _tail(square: Array, count: Array) -> Array:

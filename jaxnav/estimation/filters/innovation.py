@@ -132,7 +132,7 @@ def mask_noise(R: Array, valid: Array) -> Array:
     return jnp.where(both, dense, jnp.eye(m, dtype=R.dtype))
 
 
-def nis_of(info: Info, channels: Sequence[int]) -> Array:
+def nis_of(info: Info, channels: Sequence[int] | np.ndarray) -> Array:
     """Return the normalised innovation squared of some channels of an update.
 
     One that was not used counts nothing: its innovation is zero and its row that of the identity.

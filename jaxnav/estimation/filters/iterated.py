@@ -14,12 +14,14 @@ difference along the axes, and no covariance is ever inverted.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.checks import require_filter_params, require_own
 from jaxnav.estimation.filters.innovation import (
     Heard,
     heard_by,
@@ -122,7 +124,8 @@ def iterated_ekf(
     """
     base = ekf(model)
     form = _Form(base, _kalman_state, _additive, _derivative)
-    return _iterated(model, form, iterations, trials, search, printed=False)
+    on = partial(iterated_ekf, iterations=iterations, trials=trials, search=search)
+    return _iterated(model, form, iterations, trials, search, False, on)
 
 
 def iterated_ckf(
@@ -143,9 +146,9 @@ def iterated_ckf(
     the last iteration, in Joseph form.
 
     The number of iterations is fixed, so that gradients and ``vmap`` work. A search guards them:
-    a step that does not lower ``T`` enough is halved, and where none does the iterate stays.
-    ``FilterParams.search`` overrides the numbers of the search as leaves. ``Info`` holds the
-    innovation and likelihood of the prediction, and the number of steps that were accepted.
+    a step that does not lower ``T`` enough is halved, and where none does the iterate stays. A
+    :class:`Search` as ``FilterParams.own`` overrides the numbers of the search as leaves. ``Info``
+    holds the innovation and likelihood of the prediction, and the number of steps accepted.
 
     ``T`` knows the function, the step with a full spread its statistical linearisation only: where
     the two disagree all steps may be refused while the covariance still shrinks, which happened in
@@ -171,7 +174,8 @@ def iterated_ckf(
         right here. Arasaratnam and Haykin (2009) for the rule.
     """
     form = _Form(ckf(model), _sigma_state, _additive, _cubature)
-    return _iterated(model, form, iterations, trials, search, printed)
+    numbers = {"iterations": iterations, "trials": trials, "search": search, "printed": printed}
+    return _iterated(model, form, **numbers, on=partial(iterated_ckf, **numbers))
 
 
 def modified_iterated_ckf(
@@ -197,7 +201,8 @@ def modified_iterated_ckf(
         the second ``R`` of (23).
     """
     form = _Form(ckf(model), _sigma_state, _augmented, _cubature)
-    return _iterated(model, form, iterations, trials, search, printed)
+    numbers = {"iterations": iterations, "trials": trials, "search": search, "printed": printed}
+    return _iterated(model, form, **numbers, on=partial(modified_iterated_ckf, **numbers))
 
 
 def _iterated(
@@ -207,6 +212,7 @@ def _iterated(
     trials: int,
     search: Search | None,
     printed: bool,
+    on: Callable[[Model], Filter],
 ) -> Filter:
     if iterations < 1 or trials < 0:
         raise ValueError(
@@ -215,8 +221,18 @@ def _iterated(
         )
     built_with = Search() if search is None else search
 
+    def check(params: FilterParams) -> None:
+        require_filter_params(model, params, own=Search)
+
+    def init(params: FilterParams) -> Any:
+        return form.base.init(params._replace(own=()))
+
+    def predict(params: FilterParams, state: Any, u: Input) -> Any:
+        return form.base.predict(params._replace(own=()), state, u)
+
     def update(params: FilterParams, state: Any, u: Input, obs: Obs) -> tuple[Any, Info]:
-        rule = _search(params, built_with)
+        require_own(params.own, Search)
+        rule: Search = params.own or built_with
         prior = form.base.estimate(state)
         whitening = semidefinite_root(prior.cov)
         L = whitening.factor
@@ -249,18 +265,7 @@ def _iterated(
         taken = jnp.sum(steps.moved).astype(jnp.int32)
         return form.rebuilt(x, symmetrise(L @ whitened @ L.T)), info._replace(iterations=taken)
 
-    return form.base._replace(update=update)
-
-
-def _search(params: FilterParams, built_with: Search) -> Search:
-    if isinstance(params.search, Search):
-        return params.search
-    if not isinstance(params.search, tuple) or params.search:
-        raise ValueError(
-            f"search is a {type(params.search).__name__}; it must be a Search, or () for the one "
-            "that the filter was built with"
-        )
-    return built_with
+    return form.base._replace(init=init, predict=predict, update=update, check=check, on=on)
 
 
 def _kalman_state(x: Point, P: Array) -> KalmanState:

@@ -85,7 +85,7 @@ def kf(model: Model) -> Filter:
         Si, Wang, Niu, "High precision attitude estimation algorithm for SINS/CNS integrated
         navigation with unknown noise characteristics", Eqs. (7)-(13); Bucy and Joseph (1968).
     """
-    return ekf(with_itself_as_jacobians(model))
+    return ekf(with_itself_as_jacobians(model))._replace(model=model, on=kf)
 
 
 def ekf(model: Model) -> Filter:
@@ -156,4 +156,6 @@ def ekf(model: Model) -> Filter:
     def restart(state: KalmanState, given: Gaussian) -> KalmanState:
         return KalmanState(*given, state.indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
+    return Filter(
+        init, predict, update, estimate, restart, model.retract, model.local, check, model, ekf
+    )

@@ -10,20 +10,28 @@ and takes five iterations instead of two to be taken back; at a hundred times it
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import NOT_NEGATIVE, POSITIVE, Domain, require_part
-from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
+from jaxnav.estimation.checks import NOT_NEGATIVE, POSITIVE, Domain
 from jaxnav.estimation.filters.innovation import heard_by, masked_innovation
+from jaxnav.estimation.filters.wrapping import (
+    Builder,
+    Wrapped,
+    given,
+    parted,
+    require_additive,
+    require_wrapper,
+    with_given_noise,
+    wrapped,
+)
 from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower
 
-Builder = Callable[[Model], Filter]
-"""A filter of a model, such as :func:`~jaxnav.estimation.filters.kalman.ekf`."""
 LEAST_WEIGHT = 1e-8
 """Smallest weight of a channel: it is then as good as not there, and its noise still finite.
 
@@ -55,22 +63,24 @@ class Correntropy(NamedTuple):
     bandwidth: Array | float = 3.0
 
 
-def versoria(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
+def versoria(
+    filter: Filter | Builder, model: Model | None = None, *, iterations: int = 2
+) -> Filter:
     """Return a filter under the maximum Versoria criterion, ``w = 1 / (1 + tau |e|^p)^2``.
 
     For ``p = 2`` that is the derivative of ``V = 1 / (1 + tau e^2)`` over ``e``, up to a factor;
     another power changes the weight itself, since the derivative of ``V`` would then be singular
-    or vanish at zero. Parameters are :class:`~jaxnav.estimation.types.FilterParams` with
-    :class:`Versoria` as ``kernel``.
+    or vanish at zero. Parameters are :class:`~jaxnav.estimation.types.FilterParams` whose ``own``
+    is ``(Versoria(...), the filter's own)``, or the :class:`Versoria` alone.
 
     Args:
-        build: The filter to make robust; any of this library that takes a model.
-        model: The model.
+        filter: The filter to make robust: any single one, wrapped or not.
+        model: Its model, where ``filter`` is what builds it, as it used to be.
         iterations: Number of reweighted updates.
 
     Raises:
-        ValueError: If there is no iteration, or the model has ``noisy``, noise that does not just
-            add, which a filter would use in place of the reweighted one.
+        ValueError: If there is no iteration, the filter is a bank, or the model has ``noisy``,
+            noise that does not just add, which a filter would use in place of the reweighted one.
 
     References:
         Huang, Zhang, Xu, Wu, Chambers (2017) for reweighting by fixed-point iteration; Zhao et al.
@@ -78,20 +88,30 @@ def versoria(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
         which is not done here.
     """
     domains = {"width": NOT_NEGATIVE, "power": POSITIVE}
-    return _reweighted(build, model, _versoria_weight, Versoria(), domains, iterations)
+    inside = wrapped(filter, model, "versoria")
+    on = partial(_built, versoria, inside, iterations)
+    return _reweighted(inside, _versoria_weight, Versoria(), domains, iterations, on)
 
 
-def correntropy(build: Builder, model: Model, *, iterations: int = 2) -> Filter:
+def correntropy(
+    filter: Filter | Builder, model: Model | None = None, *, iterations: int = 2
+) -> Filter:
     """Return a filter under the maximum correntropy criterion, ``w = exp(-e^2 / (2 sigma^2))``.
 
-    Parameters are :class:`~jaxnav.estimation.types.FilterParams` with :class:`Correntropy` as
-    ``kernel``; arguments and errors are those of :func:`versoria`.
+    Its own parameters are a :class:`Correntropy`; arguments and errors are those of
+    :func:`versoria`.
 
     References:
         Chen, Liu, Zhao, Principe (2017), Automatica 76, who also reweigh the prior.
     """
     domains = {"bandwidth": POSITIVE}
-    return _reweighted(build, model, _correntropy_weight, Correntropy(), domains, iterations)
+    inside = wrapped(filter, model, "correntropy")
+    on = partial(_built, correntropy, inside, iterations)
+    return _reweighted(inside, _correntropy_weight, Correntropy(), domains, iterations, on)
+
+
+def _built(wrap: Callable, inside: Wrapped, iterations: int, model: Model) -> Filter:
+    return wrap(inside.on(model), iterations=iterations)
 
 
 def _versoria_weight(kernel: Versoria, squared: Array) -> Array:
@@ -105,12 +125,12 @@ def _correntropy_weight(kernel: Correntropy, squared: Array) -> Array:
 
 
 def _reweighted(
-    build: Builder,
-    model: Model,
+    inside: Wrapped,
     weight: Callable[[Any, Array], Array],
     default: Any,
     domains: dict[str, Domain],
     iterations: int,
+    on: Builder,
 ) -> Filter:
     """Return a filter whose update is made anew with weights from its own residuals.
 
@@ -119,18 +139,21 @@ def _reweighted(
     """
     if iterations < 1:
         raise ValueError(f"iterations is {iterations}; a robust update needs at least 1")
+    model = inside.model
     require_additive(model, "a robust filter")
-    base = build(with_given_noise(model))
+    base = inside.on(with_given_noise(model))
 
     def check(params: FilterParams) -> None:
-        base.check(params)
-        require_part(params, "kernel", type(default), domains)
+        base.check(require_wrapper(params, default, domains))
+
+    def init(params: FilterParams) -> Any:
+        return base.init(parted(params, default)[1])
 
     def predict(params: FilterParams, state: Any, u: Input) -> Any:
-        return base.predict(given(params, 1.0, 0.0), state, u)
+        return base.predict(given(parted(params, default)[1], 1.0, 0.0), state, u)
 
     def update(params: FilterParams, state: Any, u: Input, obs: Obs) -> tuple[Any, Info]:
-        kernel = default if params.kernel == () else params.kernel
+        kernel, params = parted(params, default)
         told = heard_by(model, params.model, base.estimate(state).mean, u, obs)
         obs = told.obs
         L = cholesky(told.noise).factor
@@ -150,4 +173,4 @@ def _reweighted(
         info = info._replace(iterations=info.iterations + iterations, flags=flags)
         return moved, told.upon(info)
 
-    return base._replace(predict=predict, update=update, check=check)
+    return base._replace(init=init, predict=predict, update=update, check=check, model=model, on=on)

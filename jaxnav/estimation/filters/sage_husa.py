@@ -9,22 +9,24 @@ is ``N`` in ``L N L'``, one at the start: a receiver that grades its fixes is be
 proportion, and with a constant ``R`` in the model the recursion is the papers'.
 """
 
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import POSITIVE, require_fields, require_part
-from jaxnav.estimation.filters.adaptive import (
-    ADAPTATION_DOMAINS,
-    Adaptation,
-    moved_log_factor,
-    softly_clamped,
-)
-from jaxnav.estimation.filters.given_noise import given, require_additive, with_given_noise
+from jaxnav.estimation.checks import POSITIVE
+from jaxnav.estimation.filters.adaptive import softly_clamped
 from jaxnav.estimation.filters.innovation import heard_by, mask_noise, masked_innovation
+from jaxnav.estimation.filters.wrapping import (
+    Builder,
+    given,
+    parted,
+    require_additive,
+    require_wrapper,
+    with_given_noise,
+    wrapped,
+)
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower, symmetrise
 
@@ -43,8 +45,6 @@ class SageHusa(NamedTuple):
         low: Smallest variance of a channel over the model's own, above zero; of the clamped form.
         high: Largest.
         temperature: Width of the smooth clamp, in the same unit; not used by the hard one.
-        process: :class:`~jaxnav.estimation.filters.adaptive.Adaptation` of the process noise;
-            ``()`` leaves it as the model has it.
     """
 
     forgetting: Array | float = 0.97
@@ -52,7 +52,6 @@ class SageHusa(NamedTuple):
     low: Array | float = 0.1
     high: Array | float = 100.0
     temperature: Array | float = 0.02
-    process: Any = ()
 
 
 _DOMAINS = {
@@ -71,18 +70,16 @@ class SageHusaState(NamedTuple):
         inner: That of the wrapped filter.
         noise: ``(m, m)`` the estimated ``N``.
         samples: ``(m,)`` observations of each channel.
-        log_factor: Logarithm of the factor on the process noise.
     """
 
     inner: Any
     noise: Array
     samples: Array
-    log_factor: Array
 
 
 def sage_husa(
-    build: Callable[[Model], Filter],
-    model: Model,
+    filter: Filter | Builder,
+    model: Model | None = None,
     *,
     channels: int | None = None,
     form: NoiseForm = "clamped",
@@ -90,6 +87,9 @@ def sage_husa(
     smooth: bool = False,
 ) -> Filter:
     """Return a filter that estimates its measurement noise, a wrapper of any other.
+
+    Its own parameters are a :class:`SageHusa`. That the process noise is estimated too takes
+    :func:`~jaxnav.estimation.filters.adaptive.innovation_adaptive` inside.
 
     The samples, with innovation ``nu`` of covariance ``S = H P H' + R``:
 
@@ -107,8 +107,8 @@ def sage_husa(
     and nothing is learnt in the step.
 
     Args:
-        build: The filter to make adaptive; any of this library that takes a model.
-        model: The model.
+        filter: The filter to make adaptive: any single one, wrapped or not.
+        model: Its model, where ``filter`` is what builds it, as it used to be.
         channels: Number of values ``m`` of the model's observation; of a model with named channels
             it is known.
         form: The sample.
@@ -120,7 +120,8 @@ def sage_husa(
 
     Raises:
         ValueError: If there is no such form, the residual one is asked to be ``current``, the
-            model has noise that does not just add, or ``channels`` is missing or not the model's.
+            filter is a bank, its model has noise that does not just add, or ``channels`` is missing
+            or not the model's.
 
     References:
         Sage and Husa (1969); Song et al. (2022), Sensors 22:5976, Eqs. (20)-(22).
@@ -131,30 +132,28 @@ def sage_husa(
         raise ValueError(f"form is {form!r}; it must be one of {', '.join(FORMS)}")
     if current and form == "residual":
         raise ValueError("the residual form knows the noise only after the update: current is off")
-    require_additive(model, "a filter that estimates measurement noise")
-    base, width = build(with_given_noise(model)), model.width(channels)
+    inside = wrapped(filter, model, "sage_husa")
+    own_model = inside.model
+    require_additive(own_model, "a filter that estimates measurement noise")
+    base, width = inside.on(with_given_noise(own_model)), own_model.width(channels)
 
     def check(params: FilterParams) -> None:
-        base.check(params)
-        require_part(params, "adaptation", SageHusa, _DOMAINS)
-        if isinstance(params.adaptation, SageHusa) and params.adaptation.process != ():
-            process = params.adaptation.process
-            require_fields("process of SageHusa", process, Adaptation, ADAPTATION_DOMAINS)
+        base.check(require_wrapper(params, SageHusa(), _DOMAINS))
 
     def init(params: FilterParams) -> SageHusaState:
         dtype = params.initial.cov.dtype
         unit, none = jnp.eye(width, dtype=dtype), jnp.zeros((width,), dtype)
-        return SageHusaState(base.init(params), unit, none, jnp.zeros((), dtype))
+        return SageHusaState(base.init(parted(params, SageHusa())[1]), unit, none)
 
     def predict(params: FilterParams, state: SageHusaState, u: Input) -> SageHusaState:
-        scaled = given(params, jnp.exp(state.log_factor), 0.0)
-        return state._replace(inner=base.predict(scaled, state.inner, u))
+        _, inner = parted(params, SageHusa())
+        return state._replace(inner=base.predict(given(inner, 1.0, 0.0), state.inner, u))
 
     def update(
         params: FilterParams, state: SageHusaState, u: Input, obs: Obs
     ) -> tuple[SageHusaState, Info]:
-        own = SageHusa() if params.adaptation == () else params.adaptation
-        heard_now = heard_by(model, params.model, base.estimate(state.inner).mean, u, obs)
+        own, params = parted(params, SageHusa())
+        heard_now = heard_by(own_model, params.model, base.estimate(state.inner).mean, u, obs)
         obs, nominal = heard_now.obs, heard_now.noise
         root = cholesky(nominal)
         L, scalable = root.factor, root.positive_definite
@@ -167,8 +166,8 @@ def sage_husa(
         inner, info = updated(state.noise)
         e = info.innovation
         if form == "residual":
-            after = model.observe(params.model, base.estimate(inner).mean, u)
-            e = masked_innovation(model, obs, after)
+            after = own_model.observe(params.model, base.estimate(inner).mean, u)
+            e = masked_innovation(own_model, obs, after)
         sample = _sample(form, L, mask_noise(state.noise, obs.valid), e, info.innovation_cov)
         told = obs.valid & scalable & jnp.isfinite(info.log_likelihood)
         noise = _averaged(own, state, sample, told)
@@ -184,12 +183,8 @@ def sage_husa(
             info = info._replace(
                 flags=info.flags | jnp.where(lost, int(Flag.INDEFINITE), 0).astype(jnp.int32)
             )
-        moved = state.log_factor
-        if own.process != ():
-            moved = moved_log_factor(own.process, moved, info, obs, smooth=smooth)
-        info = heard_now.upon(info)
         samples = state.samples + told.astype(state.samples.dtype)
-        return SageHusaState(inner, noise, samples, moved), info
+        return SageHusaState(inner, noise, samples), heard_now.upon(info)
 
     def estimate(state: SageHusaState) -> Gaussian:
         return base.estimate(state.inner)
@@ -197,7 +192,15 @@ def sage_husa(
     def restart(state: SageHusaState, estimate: Gaussian) -> SageHusaState:
         return state._replace(inner=base.restart(state.inner, estimate))
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
+    def on(other: Model) -> Filter:
+        return sage_husa(
+            inside.on(other), channels=width, form=form, current=current, smooth=smooth
+        )
+
+    local = own_model.local
+    return Filter(
+        init, predict, update, estimate, restart, own_model.retract, local, check, own_model, on
+    )
 
 
 def averaging(forgetting: Array | float, count: Array) -> Array:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import require_filter_params, require_prior
+from jaxnav.estimation.checks import require_filter_params, require_own, require_prior
 from jaxnav.estimation.filters.cloud import (
     Cloud,
     centre_column,
@@ -103,8 +103,8 @@ def ukf(
     columns of its negative pivots and raises :attr:`Flag.INDEFINITE`.
 
     The defaults keep the centre's weight positive for any number of states; ``kappa = 3 - n`` makes
-    it negative for n above 3. ``FilterParams.sigma`` overrides the rule, as a leaf that may be
-    tuned or differ between members.
+    it negative for n above 3. A :class:`~jaxnav.numerics.sigma.SigmaRule` as ``FilterParams.own``
+    overrides the rule, with leaves that may be tuned or differ between members.
 
     Args:
         model: The model.
@@ -192,7 +192,7 @@ def square_root_ckf(model: Model) -> Filter:
 
 def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
     """Return the filter in covariance form."""
-    check = partial(require_filter_params, model)
+    check = partial(require_filter_params, model, own=SigmaRule)
 
     def init(params: FilterParams) -> SigmaPointState:
         require_prior(model, params.initial)
@@ -241,12 +241,23 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         # Points that were kept stay until the next prediction makes them anew.
         return SigmaPointState(given.mean, given.cov, state.points, state.indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
+    return Filter(
+        init,
+        predict,
+        update,
+        estimate,
+        restart,
+        model.retract,
+        model.local,
+        check,
+        model,
+        on=lambda other: _sigma_point(other, rule_of, redraw),
+    )
 
 
 def _square_root(model: Model, rule_of: RuleOf) -> Filter:
     """Return the filter in square-root form."""
-    check = partial(require_filter_params, model)
+    check = partial(require_filter_params, model, own=SigmaRule)
 
     def init(params: FilterParams) -> SquareRootSigmaPointState:
         require_prior(model, params.initial)
@@ -298,18 +309,23 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         indefinite = state.indefinite | ~root.semidefinite
         return SquareRootSigmaPointState(given.mean, root.factor, indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
+    return Filter(
+        init,
+        predict,
+        update,
+        estimate,
+        restart,
+        model.retract,
+        model.local,
+        check,
+        model,
+        on=lambda other: _square_root(other, rule_of),
+    )
 
 
 def _rule(params: FilterParams, rule_of: RuleOf, n: int) -> SigmaRule:
-    if isinstance(params.sigma, SigmaRule):
-        return params.sigma
-    if not isinstance(params.sigma, tuple) or params.sigma:
-        raise ValueError(
-            f"sigma is a {type(params.sigma).__name__}; it must be a SigmaRule, or () for the rule "
-            "that the filter was built with"
-        )
-    return rule_of(n)
+    require_own(params.own, SigmaRule)
+    return params.own or rule_of(n)
 
 
 def _propagate(

@@ -82,7 +82,8 @@ def square_root_kf(model: Model) -> Filter:
     References:
         Kailath, Sayed, Hassibi (2000), Linear Estimation, section 12.3.
     """
-    return square_root_ekf(with_itself_as_jacobians(model))
+    filter = square_root_ekf(with_itself_as_jacobians(model))
+    return filter._replace(model=model, on=square_root_kf)
 
 
 def square_root_ekf(model: Model) -> Filter:
@@ -129,7 +130,18 @@ def square_root_ekf(model: Model) -> Filter:
         indefinite = state.indefinite | ~root.semidefinite
         return SquareRootState(given.mean, root.factor, indefinite)
 
-    return Filter(init, predict, update, estimate, restart, model.retract, model.local, check)
+    return Filter(
+        init,
+        predict,
+        update,
+        estimate,
+        restart,
+        model.retract,
+        model.local,
+        check,
+        model,
+        square_root_ekf,
+    )
 
 
 def read_array(triangle: Array, m: int, predicted: Array) -> ArrayUpdate:

@@ -1,6 +1,7 @@
-"""A vehicle at rest: its velocity is seen to be zero, by what knows that it stands.
+"""A vehicle at rest: its velocity and turn rate are seen to be zero, by what knows that it stands.
 
     0 = v   with the noise   sigma exp(v^2 / (2 v_rest^2))
+    w = eps + C' w_ie   is all that the gyros measure
 
 A car at a constant speed on a smooth road looks to its sensors as if it stood: so a stop is
 believed less, the faster the filter says the vehicle is, and not at all at several times
@@ -18,7 +19,9 @@ from jax import Array
 
 from jaxnav.estimation.models import Channel
 from jaxnav.estimation.types import Input, Params
+from jaxnav.navigation.earth import WGS84, Earth, earth_rate
 from jaxnav.navigation.states import LAYOUT, ErrorForm, SinsLevel
+from jaxnav.numerics.linalg import matmul
 
 MOST_DOUBT = 40.0
 """Logarithm of the largest factor on the variance of a rest, so that it stays finite."""
@@ -55,3 +58,23 @@ def zero_velocity(stop: Callable[[Params, Input], Stop], form: ErrorForm) -> Cha
         noise,
         differential=lambda params, x, u: lambda dx: form.to_additive(x, dx)[LAYOUT.dv],
     )
+
+
+def zero_rate(sigma: Callable[[Params, Input], Array], earth: Earth = WGS84) -> Channel:
+    """Return the channel ``(3,)`` of what gyros measure at a stop [rad/s], body axes.
+
+    The measurement is the mean angular rate as measured over the step, which at rest is the drift
+    and the Earth's rotation. Its noise is that of the prediction over the step too, which is left
+    out: it adds to an attitude what is small beside its own noise.
+
+    Args:
+        sigma: ``(params, u) -> ()`` or ``(3,)``, standard deviation of the mean rate [rad/s]: the
+            angle random walk over the root of the step's length, and what the standing body shakes.
+        earth: The Earth.
+    """
+
+    def observe(params: Params, x: SinsLevel, u: Input) -> Array:
+        del params, u
+        return x.drift + matmul(x.dcm.T, earth_rate(x.position[0], earth))
+
+    return Channel(3, observe, lambda params, x, u: jnp.broadcast_to(sigma(params, u) ** 2, (3,)))

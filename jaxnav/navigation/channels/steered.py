@@ -38,27 +38,31 @@ class Axle(NamedTuple):
     sigma: Array
 
 
+def axle_velocity(axle: Axle, x: SinsLevel, earth: Earth = WGS84) -> Array:
+    """Return the velocity of an axle ``(3,) [m/s]`` in the vehicle's axes."""
+    turning = axle.rate - x.drift - matmul(x.dcm.T, earth_rate(x.position[0], earth))
+    v = matmul(x.dcm.T, x.velocity) + jnp.cross(turning, axle.arm)
+    return matmul(so3_exp(axle.mounting), v)
+
+
 def steered(
-    axle: Callable[[Params, Input], Axle], form: ErrorForm, earth: Earth = WGS84
+    axle: Callable[[Params, SinsLevel, Input], Axle], form: ErrorForm, earth: Earth = WGS84
 ) -> Channel:
     """Return the channel ``(2,)`` of lateral and vertical velocity, which are seen to be zero.
 
     Its derivative leaves out how Earth rate turns with the attitude.
 
     Args:
-        axle: ``(params, u) -> Axle`` of the model.
+        axle: ``(params, x, u) -> Axle`` of the model.
         form: The definition of the state's error.
         earth: The Earth.
     """
 
     def observe(params: Params, x: SinsLevel, u: Input) -> Array:
-        a = axle(params, u)
-        turning = a.rate - x.drift - matmul(x.dcm.T, earth_rate(x.position[0], earth))
-        v = matmul(x.dcm.T, x.velocity) + jnp.cross(turning, a.arm)
-        return matmul(so3_exp(a.mounting), v)[1:]
+        return axle_velocity(axle(params, x, u), x, earth)[1:]
 
     def differential(params: Params, x: SinsLevel, u: Input) -> Callable[[Array], Array]:
-        a, s = axle(params, u), LAYOUT
+        a, s = axle(params, x, u), LAYOUT
         M = so3_exp(a.mounting)
 
         def seen(dx: Array) -> Array:
@@ -69,5 +73,5 @@ def steered(
         return seen
 
     return Channel(
-        2, observe, lambda params, x, u: axle(params, u).sigma ** 2, differential=differential
+        2, observe, lambda params, x, u: axle(params, x, u).sigma ** 2, differential=differential
     )

@@ -12,13 +12,14 @@ References:
     standard ones, Groves (2013), chapters 5 and 14.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.carried import Law, carrying, check_carried, own_params
 from jaxnav.estimation.models import Process, observing, shared
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.channels.gnss import Antenna, receiver
@@ -77,8 +78,21 @@ class SinsGnssInput(NamedTuple):
     dt: Array
 
 
+CARRIED = {"lever_arm": 3, "position_error": 3, "gyro_scale": 3, "accel_scale": 3}
+"""States that may be carried, and their sizes.
+
+``lever_arm`` [m] takes the place of the parameter; ``position_error`` [m] is what the receiver's
+positions are off by, east, north, up, beside white noise; the scale errors of the inertial sensors
+are measured over true less one, by axis.
+"""
+
+
 def sins_gnss(
-    error: LevelError = "additive", origin: Array | None = None, earth: Earth = WGS84
+    error: LevelError = "additive",
+    origin: Array | None = None,
+    earth: Earth = WGS84,
+    *,
+    carry: Mapping[str, Law] | None = None,
 ) -> Model:
     """Return the process :func:`inertial` as a receiver sees it.
 
@@ -91,21 +105,46 @@ def sins_gnss(
         error: The definition of the error.
         origin: Geodetic position about which the right-invariant error turns.
         earth: The Earth.
+        carry: States to carry besides, by name, with their laws. The model makes use of those of
+            :data:`CARRIED`; any other is for channels that are added.
 
     Returns:
         A model with :class:`SinsGnssParams` and :class:`SinsGnssInput`, the channels "velocity" and
-        "position" of :func:`~jaxnav.navigation.channels.gnss.receiver` and analytic Jacobians.
+        "position" of :func:`~jaxnav.navigation.channels.gnss.receiver` and analytic Jacobians. One
+        that carries states has :class:`~jaxnav.estimation.carried.CarriedParams` of these.
 
     Raises:
-        ValueError: If the error is not a known one, or the right-invariant one has no origin.
+        ValueError: If the error is not a known one, the right-invariant one has no origin, or a
+            state cannot be carried.
     """
     form = level_form(error, origin, earth)
-    return observing(inertial(form, earth), receiver(antenna, form, earth), parts=shared)
+    process, parts = inertial(form, earth), shared
+    if carry:
+        check_carried(carry, CARRIED)
+        process = carrying(process, carry, period=lambda u: u.dt, inputs=unscaled)
+        parts = own_params
+    return observing(process, receiver(antenna, form, earth), parts=parts)
 
 
-def antenna(params: SinsGnssParams, u: SinsGnssInput) -> Antenna:
-    """Return what the channels of a receiver read of the parameters and inputs."""
-    return Antenna(params.lever_arm, u.rate, params.velocity_noise, params.position_noise)
+def antenna(params: SinsGnssParams, x: Any, u: SinsGnssInput) -> Antenna:
+    """Return what the channels of a receiver read of parameters, carried states and inputs."""
+    return Antenna(
+        getattr(x, "lever_arm", params.lever_arm),
+        unscaled(getattr(x, "carried", {}), u).rate,
+        params.velocity_noise,
+        params.position_noise,
+        error=getattr(x, "position_error", None),
+    )
+
+
+def unscaled(carried: Mapping[str, Array], u: SinsGnssInput) -> SinsGnssInput:
+    """Return inputs less the scale errors of the sensors that are carried: ``u / (1 + scale)``."""
+    if "gyro_scale" in carried:
+        turn = 1 + carried["gyro_scale"]
+        u = u._replace(dtheta=u.dtheta / turn, rate=u.rate / turn)
+    if "accel_scale" in carried:
+        u = u._replace(gain=u.gain / (1 + carried["accel_scale"]))
+    return u
 
 
 def level_form(error: LevelError, origin: Array | None, earth: Earth) -> ErrorForm:

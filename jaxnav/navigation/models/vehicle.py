@@ -9,23 +9,27 @@ References:
     for the constraints; Groves (2013), sections 15.3 and 15.4.1.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.carried import Law, carrying, check_carried, own_params
 from jaxnav.estimation.models import adapted, observing, shared
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.channels.gnss import Antenna, receiver
 from jaxnav.navigation.channels.rest import Stop, zero_velocity
 from jaxnav.navigation.channels.steered import Axle, steered
 from jaxnav.navigation.earth import WGS84, Earth
+from jaxnav.navigation.models import sins_gnss
 from jaxnav.navigation.models.sins_gnss import (
     SinsGnssInput,
     SinsGnssParams,
     antenna,
     inertial,
     level_form,
+    unscaled,
 )
 from jaxnav.navigation.states import LevelError
 
@@ -33,6 +37,9 @@ FIXES = ("velocity", "position")
 """Channels of the receiver."""
 CONSTRAINTS = ("steered", "rest")
 """Channels of the constraints: all observe zero."""
+CARRIED = sins_gnss.CARRIED | {"mounting": 3, "time_offset": 1}
+"""States that may be carried, and their sizes: besides those of the SINS/GNSS model ``mounting``
+[rad] and ``time_offset`` [s], which take the place of the parameters."""
 
 
 class VehicleParams(NamedTuple):
@@ -80,6 +87,7 @@ def vehicle(
     earth: Earth = WGS84,
     *,
     constrained: bool = True,
+    carry: Mapping[str, Law] | None = None,
 ) -> Model:
     """Return the 15-state model of a vehicle on the ground.
 
@@ -89,38 +97,54 @@ def vehicle(
         earth: The Earth.
         constrained: Whether there are the channels of the constraints; without them there are those
             of the receiver, and the parameters of the constraints have no effect.
+        carry: States to carry besides, by name, with their laws. The model makes use of those of
+            :data:`CARRIED`; any other is for channels that are added.
 
     Returns:
         A model with :class:`VehicleParams` and :class:`VehicleInput`, analytic Jacobians and the
         channels of :func:`~jaxnav.navigation.channels.gnss.receiver`, "velocity" and "position",
         then :func:`~jaxnav.navigation.channels.steered.steered` and "rest",
-        :func:`~jaxnav.navigation.channels.rest.zero_velocity`.
+        :func:`~jaxnav.navigation.channels.rest.zero_velocity`. One that carries states has
+        :class:`~jaxnav.estimation.carried.CarriedParams` of :class:`VehicleParams`.
 
     Raises:
         ValueError: As :func:`~jaxnav.navigation.models.sins_gnss.sins_gnss`.
     """
     form = level_form(error, origin, earth)
     process = adapted(inertial(form, earth), lambda p: p.inner, lambda u: u.inertial)
+    parts = shared
+    if carry:
+        check_carried(carry, CARRIED)
+        process = carrying(process, carry, period=lambda u: u.inertial.dt, inputs=_unscaled)
+        parts = own_params
     channels = receiver(_late_antenna, form, earth)
     if constrained:
         channels["steered"] = steered(_axle, form, earth)
         channels["rest"] = zero_velocity(_stop, form)
-    return observing(process, channels, parts=shared)
+    return observing(process, channels, parts=parts)
 
 
-def _late_antenna(params: VehicleParams, u: VehicleInput) -> Antenna:
-    plain, inertial = antenna(params.inner, u.inertial), u.inertial
+def _unscaled(carried: Mapping[str, Array], u: VehicleInput) -> VehicleInput:
+    return u._replace(inertial=unscaled(carried, u.inertial))
+
+
+def _late_antenna(params: VehicleParams, x: Any, u: VehicleInput) -> Antenna:
+    plain = antenna(params.inner, x, u.inertial)
+    inertial = unscaled(getattr(x, "carried", {}), u.inertial)
     live = inertial.dt > 0
+    late = x.time_offset[0] if hasattr(x, "time_offset") else params.time_offset
     return plain._replace(
         velocity_sigma=u.grade * plain.velocity_sigma,
         position_sigma=u.grade * plain.position_sigma,
-        lag=params.time_offset + u.lag,
+        lag=late + u.lag,
         force=jnp.where(live, inertial.gain, 0) / jnp.where(live, inertial.dt, 1),
     )
 
 
-def _axle(params: VehicleParams, u: VehicleInput) -> Axle:
-    return Axle(params.axle, params.mounting, u.inertial.rate, params.steered_noise)
+def _axle(params: VehicleParams, x: Any, u: VehicleInput) -> Axle:
+    rate = unscaled(getattr(x, "carried", {}), u.inertial).rate
+    mounting = getattr(x, "mounting", params.mounting)
+    return Axle(params.axle, mounting, rate, params.steered_noise)
 
 
 def _stop(params: VehicleParams, u: VehicleInput) -> Stop:

@@ -115,8 +115,8 @@ def filters() -> dict[str, Filter]:
     return {
         "panel": panel(ekf(plain), rules),
         **{name: ekf(sins_gnss(form, ORIGIN)) for name, form in FORMS.items()},
-        "versoria-ekf": versoria(ekf, plain),
-        "iae": innovation_adaptive(ekf, plain),
+        "versoria-ekf": versoria(ekf(plain)),
+        "iae": innovation_adaptive(ekf(plain)),
     }
 
 
@@ -136,10 +136,8 @@ def params_of(name: str, flight: Run, shared: Shared, scales: Sequence[float]) -
         return jax.vmap(lambda d: form.from_additive(start.mean, d), 1, 1)(columns)
 
     cov = own(own(start.cov).T)
-    kernel = shared.kernel if name == "versoria-ekf" else ()
-    adaptation = shared.adaptation if name == "iae" else ()
-    initial = Gaussian(start.mean, cov)
-    return FilterParams(shared.given, initial, kernel=kernel, adaptation=adaptation)
+    of_wrappers = {"versoria-ekf": shared.kernel, "iae": shared.adaptation}
+    return FilterParams(shared.given, Gaussian(start.mean, cov), of_wrappers.get(name, ()))
 
 
 def _panel_params(flight: Run, shared: Shared, scales: Sequence[float]) -> BankParams:

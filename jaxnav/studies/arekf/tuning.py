@@ -120,7 +120,7 @@ def _params(shared: Shared, values: Values, start: Gaussian) -> FilterParams:
         gyro_noise=values["arw_deg_sqrt_h"] * DEG_PER_SQRT_HOUR,
         accel_noise=values["vrw_m_s_sqrt_h"] / HOUR**0.5,
     )
-    return FilterParams(noise, start, kernel=Versoria(values["width"], values["power"]))
+    return FilterParams(noise, start, Versoria(values["width"], values["power"]))
 
 
 def _attitude_error(estimate: Gaussian, truth: SinsLevel) -> Gaussian:
@@ -193,7 +193,7 @@ def _comparison(timing: Timing) -> Callable[[Array, Any], RunOutput]:
         def score(method: tuple[Array, Array, Versoria]) -> Array:
             gyro, accel, kernel = method
             noise = shared.given._replace(gyro_noise=gyro, accel_noise=accel)
-            params = FilterParams(noise, flight.start, kernel=kernel)
+            params = FilterParams(noise, flight.start, kernel)
             every = timing.steps_per_record
             seen = run(filter, params, flight.inputs, flight.fixes, record=dcm, every=every).record
             error = jax.vmap(so3_local)(flight.truth.dcm, seen)
@@ -218,7 +218,7 @@ def _methods(flight: Run, shared: Shared, values: Values) -> list[tuple[Array, A
     walks = {"given": given, "true": true}
     own = {name: (noise.gyro_noise, noise.accel_noise) for name, noise in walks.items()}
     return [
-        (tuned.model.gyro_noise, tuned.model.accel_noise, tuned.kernel),
+        (tuned.model.gyro_noise, tuned.model.accel_noise, tuned.own),
         (*own["given"], kernel),
         (*own["given"], plain),
         (*flight.identified, plain),

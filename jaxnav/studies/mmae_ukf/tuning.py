@@ -156,7 +156,7 @@ def _members(config: MmaeUkfConfig, sigma: Array, values: Values, start: SinsTot
     noise = noise_of(config)
     count = values["wgt"].shape[0]
     rule = unscented(STATES, values["alpha"], config.beta, values["kappa"])
-    alike = FilterParams(noise, Gaussian(start, jnp.diag(sigma**2)), sigma=rule)
+    alike = FilterParams(noise, Gaussian(start, jnp.diag(sigma**2)), rule)
     members = replicate(alike, count)
     model = members.model._replace(
         gyro_noise=values["wgt"][:, None] * noise.gyro_noise[None],

@@ -185,7 +185,7 @@ def problem_of(name: str, flight: Run, shared: Shared) -> tuple[FilterParams, An
         angles = z.at[:, 3:-3].set(inputs.angle)
         return FilterParams(shared.exact, start), inputs, SureObs(angles, valid)
     search = shared.search if "iterated" in name else ()
-    return FilterParams(shared.limb, start, search=search), inputs, SureObs(z, valid)
+    return FilterParams(shared.limb, start, search), inputs, SureObs(z, valid)
 
 
 @cache

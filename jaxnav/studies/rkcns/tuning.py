@@ -97,7 +97,7 @@ def _params(
 ) -> FilterParams:
     noise = values["refraction_noise_arcsec"] * ARCSEC
     search = shared.search._replace(step=values["step"], temperature=temperature)
-    return FilterParams(shared.limb._replace(refraction_noise=noise), start, search=search)
+    return FilterParams(shared.limb._replace(refraction_noise=noise), start, search)
 
 
 def _position_error(estimate: Gaussian, position: Array) -> Gaussian:

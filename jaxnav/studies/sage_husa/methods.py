@@ -227,7 +227,7 @@ def _stacked(trees: list[Any]) -> Any:
 @cache
 def member_of() -> Filter:
     """Return the filter that all members are."""
-    return sage_husa(ukf, informed(sins_gnss()), current=True)
+    return sage_husa(ukf(informed(sins_gnss())), current=True)
 
 
 @cache
@@ -289,7 +289,7 @@ def params_of(start: Gaussian, shared: Shared) -> BankParams:
     """Return the parameters of the panel in a run."""
     model, law = shared.members
     count = model.own.gyro_noise.shape[0]
-    members = FilterParams(model, replicate(start, count), adaptation=law)
+    members = FilterParams(model, replicate(start, count), law)
     return BankParams(members, shared.rules, shared.log_priors)
 
 

@@ -151,7 +151,7 @@ def _draw(config: SageHusaConfig, world: World, key: Array, runs: int) -> Run:
 def _member(smooth: bool) -> Filter:
     """Return the Sage-Husa filter that a member is."""
     model = informed(sins_gnss())
-    return sage_husa(ekf, model, current=True, smooth=smooth)
+    return sage_husa(ekf(model), current=True, smooth=smooth)
 
 
 def _rule(smooth: bool) -> WeightRule:
@@ -165,7 +165,7 @@ def _member_params(
     size = len(config.grid)
     model, law = jax.tree.map(lambda leaf: leaf[:size], members)
     law = law._replace(forgetting=jnp.repeat(forgetting, len(config.q_scales)))
-    own = FilterParams(model, replicate(start, size), adaptation=law)
+    own = FilterParams(model, replicate(start, size), law)
     # A function with a derivative of its own takes no NumPy arrays from a vmap inside a jit.
     return jax.tree.map(jnp.asarray, own)
 
@@ -216,12 +216,12 @@ def _watched_jvp(smooth: bool, primals: Any, tangents: Any) -> tuple[Watched, Wa
     params, drive = primals
 
     def by_forgetting(forgetting: Array) -> Watched:
-        own = params.adaptation._replace(forgetting=forgetting)
-        return _flown(smooth, params._replace(adaptation=own), drive)
+        own = params.own._replace(forgetting=forgetting)
+        return _flown(smooth, params._replace(own=own), drive)
 
-    at = params.adaptation.forgetting
+    at = params.own.forgetting
     whole, slope = jax.jvp(by_forgetting, (at,), (jnp.ones_like(at),))
-    moved = tangents[0].adaptation.forgetting
+    moved = tangents[0].own.forgetting
     return whole, jax.tree.map(lambda d: d if d.dtype == float0 else moved * d, slope)
 
 
@@ -292,7 +292,7 @@ def _comparison(config: SageHusaConfig) -> Callable[[Array, Any], RunOutput]:
         shared, values = given
         drive = drive_run(key, shared.world, clock_of(config))
         model, law = jax.tree.map(lambda leaf: leaf[chosen], shared.members)
-        others = FilterParams(model, replicate(drive.start, chosen.size), adaptation=law)
+        others = FilterParams(model, replicate(drive.start, chosen.size), law)
         rivals = jax.vmap(partial(_flown, False), (0, None), 1)(others, drive)
         own = _member_params(config, shared.members, values["forgetting"], drive.start)
         rows = {}

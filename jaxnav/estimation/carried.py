@@ -1,0 +1,264 @@
+"""States that a process carries besides its own: biases, scales and arms, each seen by name.
+
+    process = carrying(own, {"barometer_bias": gauss_markov(1)}, period=lambda u: u.dt)
+    x.position, x.barometer_bias          # a state of its own, and one that is carried
+    start = with_carried(start, {"barometer_bias": (zeros(1), variance)})
+
+Carried states move by laws of their own. The tangent space has the coordinates of the process, then
+those of the carried states in order.
+"""
+
+import keyword
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxnav.estimation.models import PROCESS, Differential, Process
+from jaxnav.estimation.types import Gaussian, Input, Params, Point
+
+
+class Carried(NamedTuple):
+    """A state with what it carries; the fields of either are attributes of the whole.
+
+    Attributes:
+        own: The state of the process.
+        carried: The carried states ``(k,)`` by name.
+    """
+
+    own: Any
+    carried: dict[str, Array]
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a carried state, or a field of the process's state, by name."""
+        if name in self.carried:
+            return self.carried[name]
+        # An array's attributes stay hidden, or the whole would be taken for an array.
+        if name in getattr(self.own, "_fields", ()) or isinstance(self.own, Carried):
+            return getattr(self.own, name)
+        raise AttributeError(f"the state has no {name!r}, nor does it carry one")
+
+
+class Law(NamedTuple):
+    """How a carried state ``(size,)`` moves, each entry alone; see :func:`gauss_markov`.
+
+    Attributes:
+        size: Number of entries.
+        keep: ``(params, dt) -> (size,)`` or ``()``: the factor on the state over ``dt`` seconds.
+        variance: ``(params, dt) -> (size,)`` or ``()``: of the noise that is added.
+    """
+
+    size: int
+    keep: Callable[[Params, Array], Array]
+    variance: Callable[[Params, Array], Array]
+
+
+class GaussMarkov(NamedTuple):
+    """Parameters of :func:`gauss_markov`: stationary sigma and correlation time [s]."""
+
+    sigma: Array
+    time: Array
+
+
+def gauss_markov(size: int) -> Law:
+    """Return a first-order Gauss-Markov process; its parameters are :class:`GaussMarkov`.
+
+        x+ = e^(-dt / time) x + w,   var w = sigma^2 (1 - e^(-2 dt / time))
+
+    References:
+        Bar-Shalom, Li, Kirubarajan (2001), section 8.2.3.
+    """
+    return Law(
+        size,
+        lambda params, dt: jnp.exp(-dt / params.time),
+        lambda params, dt: params.sigma**2 * -jnp.expm1(-2 * dt / params.time),
+    )
+
+
+def random_walk(size: int) -> Law:
+    """Return a random walk with ``var w = q^2 dt``; its parameter is ``q`` [unit/sqrt(s)]."""
+    return Law(size, lambda params, dt: jnp.ones_like(dt), lambda params, dt: params**2 * dt)
+
+
+def constant(size: int) -> Law:
+    """Return a state that does not change; its parameters are ``()``."""
+    return Law(size, lambda params, dt: jnp.ones_like(dt), lambda params, dt: jnp.zeros_like(dt))
+
+
+class CarriedParams(NamedTuple):
+    """Parameters of the process, and of each carried state's law by name."""
+
+    own: Params
+    carried: Mapping[str, Params]
+
+
+def own_params(params: CarriedParams, name: str) -> Params:
+    """Return the part of a name, as channels that read the parameters of the process take it.
+
+    For :func:`~jaxnav.estimation.models.observing` around a process that carries states.
+    """
+    return params if name == PROCESS else params.own
+
+
+def carrying(
+    process: Process,
+    states: Mapping[str, Law],
+    *,
+    period: float | Callable[[Input], Array],
+    inputs: Callable[[Mapping[str, Array], Input], Input] | None = None,
+) -> Process:
+    """Return a process that carries more states than its own.
+
+    A channel reads them by name, as ``x.name``, beside the fields of the process's state. Of a
+    model that is not in parts, :func:`~jaxnav.estimation.models.process_of` is the process.
+
+    Args:
+        process: What to add states to; it may carry some already.
+        states: Their laws by name.
+        period: Length of a step [s], or ``(u) -> dt``.
+        inputs: ``(carried, u) -> u`` as the process is to see them: less a scale factor, say.
+
+    Returns:
+        The process, with :class:`Carried` states and :class:`CarriedParams`. Its differential,
+        where the process has one, is that of the process, and automatic in how ``inputs`` lets
+        carried states in.
+
+    Raises:
+        ValueError: If there is no state, one is carried twice, its name is no name for an attribute
+            or its size is below one; in a run, if the process has a state of that name itself.
+    """
+    _check_names(process, states)
+    total = sum(law.size for law in states.values())
+    step = period if callable(period) else lambda u: jnp.asarray(period)
+    corrected = inputs or (lambda carried, u: u)
+
+    def laws(params: CarriedParams, u: Input, what: str) -> Array:
+        """Return a property of all laws, laid out as in the tangent space."""
+        dt = jnp.maximum(step(u), 0)
+        lacking = [name for name in states if name not in params.carried]
+        if lacking:
+            raise ValueError(f"there are no parameters of the carried state {lacking[0]!r}")
+        found = [
+            jnp.broadcast_to(getattr(law, what)(params.carried[name], dt), (law.size,))
+            for name, law in states.items()
+        ]
+        return jnp.concatenate(found)
+
+    def split(flat: Array) -> dict[str, Array]:
+        parts, first = {}, 0
+        for name, law in states.items():
+            parts[name] = flat[first : first + law.size]
+            first += law.size
+        return parts
+
+    def flat(carried: Mapping[str, Array]) -> Array:
+        return jnp.concatenate([carried[name] for name in states])
+
+    def moved_own(params: CarriedParams, x: Carried, u: Input) -> Point:
+        taken = set(getattr(x.own, "_fields", ())) & set(states)
+        if taken:
+            raise ValueError(f"the process has a state {min(taken)!r} itself; carry another name")
+        return process.transition(params.own, x.own, corrected(x.carried, u))
+
+    def transition(params: CarriedParams, x: Carried, u: Input) -> Carried:
+        return Carried(moved_own(params, x, u), split(laws(params, u, "keep") * flat(x.carried)))
+
+    def noise(params: CarriedParams, x: Carried, u: Input) -> Array:
+        own = process.noise(params.own, x.own, corrected(x.carried, u))
+        return jax.scipy.linalg.block_diag(own, jnp.diag(laws(params, u, "variance")))
+
+    def retract(x: Carried, dx: Array) -> Carried:
+        rest = dx.shape[0] - total
+        return Carried(process.retract(x.own, dx[:rest]), split(flat(x.carried) + dx[rest:]))
+
+    def local(x: Carried, y: Carried) -> Array:
+        return jnp.concatenate([process.local(x.own, y.own), flat(y.carried) - flat(x.carried)])
+
+    def differential(params: CarriedParams, x: Carried, u: Input) -> Differential | None:
+        by = process.differential
+        own = by and by(params.own, x.own, corrected(x.carried, u))
+        if own is None:
+            return None
+        keep = laws(params, u, "keep")
+        let_in = None if inputs is None else _by_carried(moved_own, process, params, x, u, split)
+
+        def moved(dx: Array) -> Array:
+            rest = dx.shape[0] - total
+            ahead = own(dx[:rest]) if callable(own) else own @ dx[:rest]
+            if let_in is not None:
+                ahead = ahead + let_in @ dx[rest:]
+            return jnp.concatenate([ahead, keep * dx[rest:]])
+
+        return moved
+
+    return Process(
+        transition,
+        noise,
+        retract,
+        local,
+        None if process.differential is None else differential,
+        (*process.carried, *((name, law.size) for name, law in states.items())),
+    )
+
+
+def with_carried(initial: Gaussian, states: Mapping[str, tuple[Array, Array]]) -> Gaussian:
+    """Return what is known at the start with that of carried states, which are independent of it.
+
+    Args:
+        initial: Of the process.
+        states: Mean ``(k,)`` and variance, a covariance ``(k, k)`` or its diagonal ``(k,)``, by
+            name, in the order in which they are carried.
+    """
+    wide = [cov if jnp.ndim(cov) == 2 else jnp.diag(cov) for _, cov in states.values()]
+    mean = Carried(initial.mean, {name: jnp.asarray(value) for name, (value, _) in states.items()})
+    return Gaussian(mean, jax.scipy.linalg.block_diag(initial.cov, *wide))
+
+
+def check_carried(states: Mapping[str, Law], known: Mapping[str, int]) -> None:
+    """Check states that a model is to carry against those that it makes use of.
+
+    Args:
+        states: Their laws by name.
+        known: Sizes of those that the model knows by name; others are for channels to come.
+
+    Raises:
+        ValueError: If one that is known has another size, or an unknown name is nearly a known one.
+    """
+    for name, law in states.items():
+        near = get_close_matches(name, known, 1)
+        if name not in known and near:
+            raise ValueError(f"the model makes no use of {name!r}; did you mean {near[0]!r}?")
+        if known.get(name, law.size) != law.size:
+            raise ValueError(
+                f"the carried state {name!r} has the size {law.size}; it must be {known[name]}"
+            )
+
+
+def _check_names(process: Process, states: Mapping[str, Law]) -> None:
+    before = {name for name, _ in process.carried}
+    if not states:
+        raise ValueError("there is no state to carry; name one or more, with its law")
+    for name, law in states.items():
+        if name in before:
+            raise ValueError(f"the state {name!r} is carried twice; carry each once")
+        if not name.isidentifier() or keyword.iskeyword(name) or hasattr(Carried, name):
+            raise ValueError(f"{name!r} cannot be the name of a carried state; take an attribute's")
+        if law.size < 1:
+            raise ValueError(f"the carried state {name!r} has the size {law.size}; it must be >= 1")
+
+
+def _by_carried(
+    moved_own: Callable, process: Process, params: Params, x: Carried, u: Input, split: Callable
+) -> Array:
+    """Return the derivative ``(n, k)`` of the process's next state by the carried ones."""
+    ahead = moved_own(params, x, u)
+
+    def by(d: Array) -> Array:
+        disturbed = {name: x.carried[name] + part for name, part in split(d).items()}
+        return process.local(ahead, moved_own(params, Carried(x.own, disturbed), u))
+
+    size = sum(value.shape[0] for value in x.carried.values())
+    return jax.jacfwd(by)(jnp.zeros(size, next(iter(x.carried.values())).dtype))
