@@ -31,6 +31,8 @@ commands:
   allan LOG     noise coefficients of an inertial sensor from a log at rest
   doctor        versions, devices, 64-bit floats, compilation cache
 
+list, filter and tune take --from FILE: a Python file with filters or wrappers of your own.
+
 `jaxnav --version` prints the version.
 
 exit codes: 0 done, 2 bad input, 3 some runs diverged, 4 a fault under --strict, 130 interrupted
@@ -92,9 +94,35 @@ def _no_options(command: str, rest: list[str]) -> bool:
     return bool(rest)
 
 
+def _with_own(rest: list[str]) -> list[str]:
+    """Load the files behind ``--from``, and return the other arguments.
+
+    Raises:
+        ConfigError: If one is missing, or cannot be used.
+    """
+    others, paths = [], []
+    waiting = iter(rest)
+    for argument in waiting:
+        if argument == "--from":
+            paths.append(next(waiting, ""))
+        elif argument.startswith("--from="):
+            paths.append(argument.removeprefix("--from="))
+        else:
+            others.append(argument)
+    for path in paths:
+        from jaxnav.estimation.register import load
+
+        try:
+            load(Path(path))
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    return others
+
+
 def _list(rest: list[str]) -> int:
+    rest = _with_own(rest)
     if _no_options("list", rest):
-        print("usage: jaxnav list")
+        print("usage: jaxnav list [--from FILE]")
         return OK
     from jaxnav.report.catalogue import print_catalogue
 
@@ -153,6 +181,7 @@ def _run(rest: list[str]) -> int:
 
 
 def _tune(rest: list[str]) -> int:
+    rest = _with_own(rest)
     if not rest or rest[0] in ("-h", "--help"):
         print(f"usage: jaxnav tune STUDY|LOG [options]; STUDY is {_either(STUDIES)}")
         return OK if rest else BAD_INPUT
@@ -227,6 +256,7 @@ def _options_after_log(command: str, rest: list[str]) -> list[str] | None:
 
 
 def _filter(rest: list[str]) -> int:
+    rest = _with_own(rest)
     options = _options_after_log("filter", rest)
     if options is None:
         return BAD_INPUT

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -10,21 +11,16 @@ from jaxnav.estimation.banks.mixture import BankParams, bank, immae, mmae
 from jaxnav.estimation.banks.reset import WindowedReset
 from jaxnav.estimation.banks.weights import Penalty, bayes, chain, floor, forget, markov, penalty
 from jaxnav.estimation.bounds import oracle
-from jaxnav.estimation.filters.adaptive import Adaptation, innovation_adaptive
-from jaxnav.estimation.filters.iterated import (
-    iterated_ckf,
-    iterated_ekf,
-    modified_iterated_ckf,
-)
 from jaxnav.estimation.filters.kalman import ekf, kf
-from jaxnav.estimation.filters.robust import Correntropy, Versoria, correntropy, versoria
-from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
-from jaxnav.estimation.filters.sigma_point import ckf, square_root_ckf, square_root_ukf, ukf
-from jaxnav.estimation.filters.square_root import square_root_ekf, square_root_kf
+from jaxnav.estimation.filters.sage_husa import SageHusa
+from jaxnav.estimation.filters.square_root import square_root_kf
+from jaxnav.estimation.register import FILTER, WRAPPER, by_kind, entries
 from jaxnav.estimation.types import Filter, FilterParams, Model, replicate
 
 THETA = (0.2, 1.0, 8.0)
 """Factors on the process noise of a bank's members."""
+LINEAR = ("kf", "square_root_kf")
+"""Filters that want a linear model."""
 SWITCHING = uniform_switching(3, 0.05)
 
 
@@ -50,15 +46,8 @@ def noise_adaptation(forgetting: float, prior_count: float) -> SageHusa:
 
 def _plain(name: str, base: FilterParams) -> FilterParams:
     """Parameters of one filter that leave its noise and its data as they are."""
-    settings: dict[str, dict[str, Any]] = {
-        "versoria": {"kernel": Versoria(jnp.array(0.0), jnp.array(2.0))},
-        "correntropy": {"kernel": Correntropy(jnp.array(jnp.inf))},
-        "innovation_adaptive": {
-            "adaptation": Adaptation(jnp.array(5.0), jnp.array(1.0), jnp.array(1.0))
-        },
-        "sage_husa": {"adaptation": noise_adaptation(1.0, jnp.inf)},
-    }
-    return base._replace(**settings.get(name, {}))
+    idle = entries()[name].idle if name in entries() else ()
+    return base._replace(own=jax.tree.map(lambda leaf: jnp.array(leaf, float), idle))
 
 
 def _members(base: FilterParams, *theta: float) -> FilterParams:
@@ -67,26 +56,14 @@ def _members(base: FilterParams, *theta: float) -> FilterParams:
     return alike._replace(model=alike.model._replace(q=jnp.array(theta)))
 
 
-def _singles(model: Model, channels: int, bent: Model) -> dict[str, Filter]:
-    base = kf(model)
-    return {
-        "kf": base,
-        "square_root_kf": square_root_kf(model),
-        "oracle": oracle(base, lambda params, u: params),
-        "ekf": ekf(bent),
-        "square_root_ekf": square_root_ekf(bent),
-        "ukf": ukf(bent),
-        "ckf": ckf(bent),
-        "square_root_ukf": square_root_ukf(bent),
-        "square_root_ckf": square_root_ckf(bent),
-        "iterated_ekf": iterated_ekf(bent),
-        "iterated_ckf": iterated_ckf(bent),
-        "modified_iterated_ckf": modified_iterated_ckf(bent),
-        "versoria": versoria(ekf(bent)),
-        "correntropy": correntropy(ekf(bent), iterations=1),
-        "innovation_adaptive": innovation_adaptive(ekf(bent)),
-        "sage_husa": sage_husa(ekf(bent), channels=channels),
+def _singles(model: Model, bent: Model) -> dict[str, Filter]:
+    """Return all that is registered, wrappers around the extended filter."""
+    known = by_kind()
+    single = {
+        name: entry.make(model if name in LINEAR else bent) for name, entry in known[FILTER].items()
     }
+    wrapped = {name: entry.make(ekf(bent)) for name, entry in known[WRAPPER].items()}
+    return {**single, "oracle": oracle(kf(model), lambda params, u: params), **wrapped}
 
 
 def _banks(model: Model, singles: dict[str, Filter]) -> dict[str, tuple[Filter, Any]]:
@@ -119,7 +96,8 @@ def cases(
         channels: Of its observation.
         bent: The model of the filters that need no linear one, if that is another.
     """
-    singles = _singles(model, channels, bent or model)
+    named = (("all", channels),)
+    singles = _singles(model, (bent or model)._replace(channels=named))
     table = {
         name: Case(made, _plain(name, base), _plain(name, base)) for name, made in singles.items()
     }

@@ -13,6 +13,7 @@ import pytest
 from jaxnav import compiling
 from jaxnav.cli import configure_jax
 from jaxnav.datasets.base import DataError
+from jaxnav.estimation.register import load
 
 OPTIMISED = dict(compiling.OPTIONS)
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
@@ -21,6 +22,11 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Filters and wrappers of a file join the tables of laws: `pytest --from FILE`."""
+    parser.addoption("--from", action="append", default=[], dest="own_files", metavar="FILE")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -36,6 +42,8 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["XDG_CACHE_HOME"] = folder
     configure_jax()
+    for path in config.getoption("own_files") or []:
+        load(Path(path))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -46,6 +46,7 @@ ORDER = (
     "estimation.banks.reset",
     "estimation.banks.mixture",
     "estimation.banks.imm",
+    "estimation.register",
     "estimation.run",
     "estimation.montecarlo",
     "estimation.metrics",

@@ -228,7 +228,7 @@ def check_carried(states: Mapping[str, Law], known: Mapping[str, int]) -> None:
         ValueError: If one that is known has another size, or an unknown name is nearly a known one.
     """
     for name, law in states.items():
-        near = get_close_matches(name, known, 1)
+        near = get_close_matches(name, known, 1, cutoff=0.8)
         if name not in known and near:
             raise ValueError(f"the model makes no use of {name!r}; did you mean {near[0]!r}?")
         if known.get(name, law.size) != law.size:

@@ -14,7 +14,14 @@ from jaxnav.studies.base import (
     require_positive,
 )
 
-FilterName = Literal["ekf", "ukf", "liekf", "se23-ekf", "versoria-ekf", "sage-husa-ekf", "iae"]
+ALIASES = {
+    "liekf": "ekf",
+    "se23-ekf": "ekf",
+    "versoria-ekf": "versoria(ekf)",
+    "sage-husa-ekf": "sage_husa(ekf)",
+    "iae": "innovation_adaptive(ekf)",
+}
+"""Short names of filters; the first two have a definition of the error of their own."""
 RuleName = Literal["floor", "bayes", "fixed", "forget", "markov", "penalty"]
 When = Literal["auto", "on", "off"]
 
@@ -30,10 +37,12 @@ class FilterConfig:
 
     Attributes:
         config: TOML file with these names; flags go before it.
-        filter: The filter, or the members of the bank.
+        filter: The filter, or the members of the bank: any of `jaxnav list`, in wrappers as
+            sage_husa(versoria(ekf)), or one of the short names liekf (left-invariant errors),
+            se23-ekf (right-invariant ones), versoria-ekf, sage-husa-ekf and iae.
         r_factors: Factors on the variances of the receiver, a member each.
         q_factors: Factors on the process noise, a member each.
-        forgetting: Forgetting factors of sage-husa-ekf, a member each.
+        forgetting: Forgetting factors of sage_husa, a member each.
         rule: How a bank weighs its members; floor is Bayes' rule with a floor, and forget and
             markov are before Bayes' rule too.
         weight_floor: Least weight of a member under floor.
@@ -80,7 +89,7 @@ class FilterConfig:
     """
 
     config: Path | None = None
-    filter: FilterName = "ekf"
+    filter: str = "ekf"
     r_factors: tuple[float, ...] = (1.0,)
     q_factors: tuple[float, ...] = (1.0,)
     forgetting: tuple[float, ...] = (0.97,)
@@ -136,7 +145,7 @@ ALONE: dict[str, Any] = {
 def check(config: FilterConfig) -> None:
     """Raise :class:`~jaxnav.studies.base.ConfigError` if a parameter is out of its range."""
     require_finite(config)
-    require_choice(config, "filter", "rule", "outages")
+    require_choice(config, "rule", "outages")
     require_positive(
         config,
         *("r_factors", "q_factors", "forgetting", "rule_time_s"),
@@ -149,10 +158,10 @@ def check(config: FilterConfig) -> None:
     good = all(b <= 1 for b in config.forgetting)
     require(good, "forgetting", config.forgetting, "in (0, 1]")
     require(
-        len(config.forgetting) == 1 or config.filter == "sage-husa-ekf",
+        len(config.forgetting) == 1 or "sage_husa" in parts_of(config.filter),
         "forgetting",
         config.forgetting,
-        f"one factor for {config.filter}; several make a bank of sage-husa-ekf",
+        f"one factor for {config.filter}; several make a bank of sage_husa(...)",
     )
     accepted = "above 0 and below 1"
     require(config.gate_false_alarm < 1, "gate_false_alarm", config.gate_false_alarm, accepted)
@@ -170,6 +179,21 @@ def check(config: FilterConfig) -> None:
     _check_spans(config)
     require(config.noise_runs >= 1, "noise_runs", config.noise_runs, "at least 1")
     require(0 <= config.seed < 2**63, "seed", config.seed, "between 0 and 2**63 - 1")
+
+
+def parts_of(name: str) -> tuple[str, ...]:
+    """Return the wrappers and the filter that a name stands for, outermost first.
+
+    Raises:
+        ConfigError: If there is no such filter.
+    """
+    from jaxnav.estimation.register import chain_of
+
+    try:
+        return chain_of(ALIASES.get(name, name))
+    except ValueError as error:
+        short = ", ".join(ALIASES)
+        raise ConfigError(f"{error}; or a short name: {short}") from None
 
 
 def members(config: FilterConfig) -> int:
@@ -232,7 +256,7 @@ def _typed(name: str, kind: Any, value: Any) -> Any:
     if kind is float:
         require(_is_number(value), name, repr(value), "a number")
         return float(value)
-    accepted = {bool: "true or false", int: "a whole number"}[kind]
+    accepted = {bool: "true or false", int: "a whole number", str: "a text"}[kind]
     require(type(value) is kind, name, repr(value), accepted)
     return value
 

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,12 +22,9 @@ from jaxnav.estimation.banks.weights import (
     markov,
     penalty,
 )
-from jaxnav.estimation.filters.adaptive import innovation_adaptive
 from jaxnav.estimation.filters.gated import Gate, Gated, gated
-from jaxnav.estimation.filters.kalman import ekf
-from jaxnav.estimation.filters.robust import versoria
-from jaxnav.estimation.filters.sage_husa import SageHusa, sage_husa
-from jaxnav.estimation.filters.sigma_point import ukf
+from jaxnav.estimation.filters.sage_husa import SageHusa
+from jaxnav.estimation.register import built
 from jaxnav.estimation.run import Recorder
 from jaxnav.estimation.types import (
     ChannelInfo,
@@ -41,8 +38,9 @@ from jaxnav.estimation.types import (
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
 from jaxnav.navigation.states import ErrorForm, LevelError, SinsLevel, error_form
-from jaxnav.recorded.config import FilterConfig, members
+from jaxnav.recorded.config import FilterConfig, members, parts_of
 from jaxnav.recorded.preparation import Drive
+from jaxnav.studies.base import ConfigError
 from jaxnav.units import DEG, GRAVITY
 
 ERRORS: dict[str, LevelError] = {"liekf": "left-invariant", "se23-ekf": "right-invariant"}
@@ -98,7 +96,7 @@ def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> 
         origin: Position about which the right-invariant error turns.
         constrained: Whether the model has the channels of the constraints.
     """
-    error = ERRORS.get(config.filter, "additive")
+    error: LevelError = ERRORS.get(config.filter, "additive")
     about = tuple(np.asarray(origin).tolist()) if error == "right-invariant" else (0.0, 0.0, 0.0)
     weighed = config.rule if members(config) > 1 else None
     return _method(config.filter, weighed, config.gate, error, about, constrained)
@@ -138,22 +136,18 @@ def _method(
     return Method(chosen, model, form, record, weighed is not None)
 
 
-def indices(model: Model, name: str) -> range:
-    """Return the places of a channel in an observation."""
-    at = model.channel(name)
-    return range(at.start, at.stop)
-
-
 def member(name: str, model: Model) -> Filter:
-    """Return a single filter by its name."""
-    builders: dict[str, Callable[[], Filter]] = {
-        "ukf": lambda: ukf(model),
-        "versoria-ekf": lambda: versoria(ekf(model)),
-        "sage-husa-ekf": lambda: sage_husa(ekf(model)),
-        "iae": lambda: innovation_adaptive(ekf(model)),
-        **dict.fromkeys(("ekf", *ERRORS), lambda: ekf(model)),
-    }
-    return builders[name]()
+    """Return a single filter by its name.
+
+    Raises:
+        ConfigError: If there is none, or it cannot filter this model.
+    """
+    try:
+        return built(parts_of(name), model)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{name} cannot filter a drive: {error}") from error
 
 
 def rule(name: str) -> WeightRule:
@@ -245,17 +239,24 @@ def _ungated(
     mean = drive.initial.mean
     cov = columns(form.from_additive, mean, drive.initial.cov)
     one = FilterParams(model_params(config, drive, lever_arm, mounting), Gaussian(mean, cov))
-    if config.filter == "sage-husa-ekf":
-        one = one._replace(own=sage_husa_params(jnp.array(config.forgetting[0])))
+    names = parts_of(config.filter)
+    one = one._replace(own=_own(names, jnp.array(config.forgetting[0])))
     if members(config) == 1:
         return _scaled(one, jnp.array(config.r_factors[0]), jnp.array(config.q_factors[0]))
     grid = jnp.array(grid_of(config))
     several = replicate(one, len(grid))
-    if config.filter == "sage-husa-ekf":
-        several = several._replace(own=several.own._replace(forgetting=grid[:, 2]))
+    several = several._replace(own=jax.vmap(partial(_own, names))(grid[:, 2]))
     several = jax.vmap(_scaled)(several, grid[:, 0], grid[:, 1])
     period = float(np.median(np.asarray(drive.inputs.inertial.dt)))
     return BankParams(several, rule_params(config, period))
+
+
+def _own(names: tuple[str, ...], forgetting: Array) -> Any:
+    """Return the parameters of wrappers and filter, those of Sage-Husa for any receiver."""
+    own: Any = ()
+    for name in reversed(names[:-1]):
+        own = (sage_husa_params(forgetting) if name == "sage_husa" else (), own)
+    return own
 
 
 def sage_husa_params(forgetting: Array) -> SageHusa:

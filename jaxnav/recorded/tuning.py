@@ -17,7 +17,7 @@ from jaxnav.estimation.tune.transforms import POSITIVE, UNIT, between
 from jaxnav.estimation.types import Filter, Info, Obs
 from jaxnav.findings import Finding
 from jaxnav.recorded.audit import audit
-from jaxnav.recorded.config import FilterConfig, members
+from jaxnav.recorded.config import FilterConfig, members, parts_of
 from jaxnav.recorded.methods import filter_params, method
 from jaxnav.recorded.offset import likeliest_offset
 from jaxnav.recorded.preparation import Drive, prepare
@@ -121,7 +121,7 @@ def _parameters(config: FilterConfig) -> dict[str, Parameter]:
     if len(config.q_factors) > 1:
         text = "factors on the process noise; their scale is that of the densities"
         parameters["q_factors"] = Parameter(_start(config, "q_factors"), POSITIVE, text)
-    if config.filter == "sage-husa-ekf":
+    if "sage_husa" in parts_of(config.filter):
         parameters["forgetting"] = Parameter(
             _start(config, "forgetting"), UNIT, "forgetting factors"
         )

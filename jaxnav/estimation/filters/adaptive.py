@@ -42,6 +42,7 @@ class Adaptation(NamedTuple):
     temperature: Array | float = 0.02
 
 
+IDLE = {"innovation_adaptive": Adaptation(low=1.0, high=1.0)}
 _DOMAINS = {
     "memory": ("[1, inf)", 1.0, jnp.inf),
     "low": POSITIVE,

@@ -28,6 +28,7 @@ class Gate(NamedTuple):
     patience: Array | float = 5.0
 
 
+IDLE = {"gated": Gate(false_alarm=1e-30)}
 _DOMAINS = {"false_alarm": ("(0, 1)", 0.0, 1.0), "patience": ("(0, inf]", 0.0, jnp.inf)}
 
 

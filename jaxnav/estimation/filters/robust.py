@@ -9,6 +9,7 @@ wider than the noise: where ``H P- H'`` is some 25 times ``R``, the plain update
 and takes five iterations instead of two to be taken back; at a hundred times it is believed.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -61,6 +62,9 @@ class Correntropy(NamedTuple):
     """
 
     bandwidth: Array | float = 3.0
+
+
+IDLE = {"versoria": Versoria(width=0.0), "correntropy": Correntropy(math.inf)}
 
 
 def versoria(

@@ -9,6 +9,7 @@ is ``N`` in ``L N L'``, one at the start: a receiver that grades its fixes is be
 proportion, and with a constant ``R`` in the model the recursion is the papers'.
 """
 
+import math
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -54,6 +55,7 @@ class SageHusa(NamedTuple):
     temperature: Array | float = 0.02
 
 
+IDLE = {"sage_husa": SageHusa(1.0, prior_count=math.inf)}
 _DOMAINS = {
     "forgetting": ("(0, 1]", 0.0, 1.0),
     "prior_count": ("[0, inf]", 0.0, jnp.inf),
