@@ -56,7 +56,6 @@ ORDER = (
     "estimation.tune.losses",
     "estimation.tune.fit",
     "estimation.tune.inspect",
-    "estimation",
     "navigation.earth",
     "navigation.atmosphere",
     "navigation.limb",

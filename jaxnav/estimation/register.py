@@ -24,7 +24,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, get_args, get_type_hints
 
-from jaxnav.estimation import banks, filters
 from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.types import Filter, Model
 
@@ -149,8 +148,8 @@ def built(names: tuple[str, ...], model: Model) -> Filter:
     return filter
 
 
-def functions_of(package: ModuleType) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
-    """Yield the public functions of a folder's modules, in order, with the types they state."""
+def functions_of(package: str) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
+    """Yield the public functions of a package's modules, with the types that they state."""
     for module in _inside(package):
         yield from _functions(module)
 
@@ -162,15 +161,15 @@ def plain(documentation: str | None) -> str:
     return re.sub(r", with parameters \w+\.$", "", line.replace("``", "").removesuffix(" "))
 
 
-def _inside(package: ModuleType) -> Iterator[ModuleType]:
-    for found in pkgutil.iter_modules(package.__path__):
-        yield importlib.import_module(f"{package.__name__}.{found.name}")
+def _inside(package: str) -> Iterator[ModuleType]:
+    for found in pkgutil.iter_modules(importlib.import_module(package).__path__):
+        yield importlib.import_module(f"{package}.{found.name}")
 
 
 def _modules() -> Iterator[tuple[ModuleType, str]]:
     """Yield modules, and what takes a filter in them."""
-    for package, around in ((filters, WRAPPER), (banks, BANK)):
-        for module in _inside(package):
+    for folder, around in (("filters", WRAPPER), ("banks", BANK)):
+        for module in _inside(f"jaxnav.estimation.{folder}"):
             yield module, around
     for point in entry_points(group=GROUP):
         yield point.load(), WRAPPER

@@ -8,7 +8,6 @@ from rich.table import Table
 
 from jaxnav.estimation.models import Channel
 from jaxnav.estimation.register import by_kind, functions_of, plain
-from jaxnav.navigation import channels
 from jaxnav.studies import STUDIES
 
 
@@ -38,7 +37,7 @@ def _channels() -> dict[str, str]:
     """Return what makes a channel, or several by name, with what it is."""
     return {
         function.__name__: plain(function.__doc__)
-        for function, types in functions_of(channels)
+        for function, types in functions_of("jaxnav.navigation.channels")
         if Channel in (types.get("return"), *get_args(types.get("return")))
     }
 
