@@ -41,7 +41,8 @@ class Case(NamedTuple):
 
 def noise_adaptation(forgetting: float, prior_count: float) -> SageHusa:
     """How a filter that estimates its measurement noise does so; 1 and infinity: not at all."""
-    return SageHusa(*map(jnp.array, (forgetting, prior_count, 0.1, 100.0, 0.02)))
+    numbers = forgetting, prior_count, 0.1, 100.0, 0.02
+    return SageHusa(*(jnp.array(number, float) for number in numbers))
 
 
 def _plain(name: str, base: FilterParams) -> FilterParams:

@@ -1,16 +1,20 @@
 """What further sensors do for a drive whose fixes are hidden, and for a recorded rocket."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxnav.compiling import compiled
-from jaxnav.estimation.carried import Carried, CarriedParams, random_walk, with_carried
+from jaxnav.estimation.carried import Carried, CarriedParams, carrying, random_walk, with_carried
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.metrics import chi2_mean_bounds, nees
-from jaxnav.estimation.models import ModelParams, measured, observing
+from jaxnav.estimation.models import ModelParams, Process, measured, observing
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian
+from jaxnav.navigation.atmosphere import pressure_height
 from jaxnav.navigation.channels.barometer import Barometer, barometer
 from jaxnav.navigation.models.sins_gnss import sins_gnss
 from jaxnav.navigation.trajectory.vehicle import town_legs
@@ -69,3 +73,46 @@ def test_a_barometer_holds_the_height_while_fixes_are_hidden() -> None:
     assert np.sqrt(np.mean(alone**2)) > 5 * np.sqrt(np.mean(vertical**2))
     low, high = chi2_mean_bounds(16, RUNS)
     assert low < np.mean(squared) < high
+
+
+ROCKET = Path(__file__).parents[2] / "shared" / "data" / "rocket_hedy"
+
+
+@pytest.mark.skipif(not ROCKET.exists(), reason="the recorded rocket is not in ../shared/data")
+def test_the_barometer_of_a_recorded_rocket_finds_its_apogee() -> None:
+    """By a vertical filter, in air taken as the standard one.
+
+    The bias is carried, and known at the start to be the pressure height of the ground.
+    """
+
+    def columns(name: str, *which: int) -> np.ndarray:
+        return np.genfromtxt(ROCKET / name, delimiter=",", skip_header=1, usecols=which).T
+
+    (time, pressure), own = columns("baro.csv", 0, 3), columns("flightInfo.csv", 0, 1)
+    flown = time < 60
+    heights = pressure_height(jnp.asarray(pressure[flown]))
+    dt = 0.01
+    jerked = jnp.array([dt**3 / 6, dt**2 / 2, dt])
+    Phi = jnp.array([[1, dt, dt**2 / 2], [0, 1, dt], [0, 0, 1]])
+    vertical = Process(lambda p, x, u: Phi @ x, lambda p, x, u: p * jnp.outer(jerked, jerked))
+    bias = "barometer_bias"
+    model = observing(
+        carrying(vertical, {bias: random_walk(1)}, period=dt),
+        {"barometer": barometer(lambda x: x.own[0])},
+    )
+    ground = jnp.mean(heights[:50])
+    start = Gaussian(jnp.zeros(3), jnp.diag(jnp.array([0.01, 0.01, 1.0])))
+    params = FilterParams(
+        ModelParams(
+            CarriedParams(jnp.array(100.0**2), {bias: jnp.array(WALK)}),
+            {"barometer": Barometer(jnp.array(3.0), jnp.array(0.0), jnp.array(1.0))},
+        ),
+        with_carried(start, {bias: (ground[None], jnp.array([1.0]))}),
+    )
+    obs = model.stack({"barometer": heights[:, None]})
+    mean = run(ekf(model), params, jnp.zeros(len(heights)), obs).record[0].mean
+    height = np.asarray(mean.own[:, 0])
+    top = int(np.argmax(height))
+    published = np.argmax(own[1])
+    assert abs(height[top] - own[1, published]) < 40
+    assert abs(time[top] - own[0, published]) < 1.5

@@ -417,9 +417,9 @@ NOISE_GIVEN = (versoria, correntropy, innovation_adaptive, partial(sage_husa, ch
 @pytest.mark.parametrize("build", NOISE_GIVEN)
 @pytest.mark.parametrize("wrong", MISFITS)
 def test_filters_that_hand_noise_to_their_model_name_it_too(
-    build: Callable[[Callable[[Model], Filter], Model], Filter], wrong: str
+    build: Callable[[Filter], Filter], wrong: str
 ) -> None:
     model, params, obs, message = MISFITS[wrong]
     channels = r"|3 channels" if wrong == "data" else ""
     with pytest.raises(ValueError, match=message + channels):
-        run(build(ekf, model), params, PROBLEM.inputs, obs)
+        run(build(ekf(model)), params, PROBLEM.inputs, obs)

@@ -1,6 +1,7 @@
 """The order of dependence: a module imports only from the layers below it."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import jaxnav
@@ -200,6 +201,7 @@ EDGES = {"matplotlib", "rich", "tyro"}
 EDGE_MODULES = {"plotting", "report", "doctor", "options"}
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Every module with code, by its dotted name below jaxnav."""
     found = {}
@@ -210,6 +212,7 @@ def modules() -> dict[str, Path]:
     return found
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """The modules a file imports, wherever in the file."""
     names: set[str] = set()
