@@ -260,8 +260,9 @@ def _filter(rest: list[str]) -> int:
     options = _options_after_log("filter", rest)
     if options is None:
         return BAD_INPUT
-    from jaxnav.options import parse_filter
+    from jaxnav.options import parse_filter, spread
 
+    options = spread(options, "--carry")
     parsed = parse_filter(options)
     if parsed is None:
         return OK

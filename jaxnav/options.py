@@ -77,6 +77,20 @@ def parse_tune(name: str, study: type, arguments: list[str]) -> Options | None:
     return _parse(program, TuneConfig, out, files, arguments, study=given)
 
 
+def spread(arguments: list[str], flag: str) -> list[str]:
+    """Return arguments with the values of a flag that stand between commas apart."""
+    found, listing = [], False
+    for argument in arguments:
+        if argument.startswith(f"{flag}="):
+            found += [flag, *argument.removeprefix(f"{flag}=").split(",")]
+        elif listing and not argument.startswith("-"):
+            found += argument.split(",")
+        else:
+            found.append(argument)
+            listing = argument == flag
+    return found
+
+
 def _value_of(flag: str, arguments: list[str]) -> str | None:
     """Return the last value of a flag, as ``--flag value`` or ``--flag=value``."""
     found = None

@@ -172,6 +172,7 @@ ORDER = (
     "tuning.selection",
     "tuning.analysis",
     "tuning.figures",
+    "recorded.carry",
     "recorded.config",
     "recorded.motion",
     "recorded.start",

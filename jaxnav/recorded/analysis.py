@@ -13,6 +13,7 @@ from jaxnav.estimation.types import Flag
 from jaxnav.findings import document_of, faults
 from jaxnav.navigation.models.vehicle import CONSTRAINTS, FIXES
 from jaxnav.recorded.audit import audit
+from jaxnav.recorded.carry import told
 from jaxnav.recorded.config import FilterConfig, check, members
 from jaxnav.recorded.experiments import (
     NoiseScores,
@@ -108,7 +109,7 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
     if lost:
         notes.append("a run with fixes hidden diverged")
     findings = audit(log, drive, kept)
-    off = fix_errors(chosen.model, single_model(params), drive, kept.mean)
+    off = fix_errors(chosen.model, single_model(params), drive, kept.state)
     names = member_names(config) if members(config) > 1 else []
     document = {
         "schema": SCHEMA,
@@ -120,6 +121,12 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         "time_offset": _offset(config, offset),
         "members": names,
         "filter": _filter_scores(drive, kept, off),
+        "channels": _channel_scores(drive, kept),
+        "carried": told(
+            config.carry,
+            {name: np.asarray(values)[-1] for name, values in kept.carried.items()},
+            np.asarray(kept.carried_sigma)[-1],
+        ),
         "audit": document_of(findings),
         "faults": faults(findings),
         "refused": _refused(log, drive, kept),
@@ -219,6 +226,23 @@ def _filter_scores(drive: Drive, kept: Kept, off: dict[str, np.ndarray]) -> dict
         "gyro_drift_dps": np.asarray(kept.mean.drift)[-1] / DEG,
         "accel_bias": np.asarray(kept.mean.bias)[-1],
     }
+
+
+def _channel_scores(drive: Drive, kept: Kept) -> dict[str, Any]:
+    """Return by channel how often it arrived and was refused, and its NIS per value used."""
+    found = {}
+    for name, part in kept.parts.items():
+        used, refused = np.asarray(part.used), np.asarray(part.refused)
+        count = int(used.sum())
+        nis = float(np.asarray(part.nis)[used.any(axis=1)].sum()) / count if count else None
+        arrived = drive.channels[name].valid.any(axis=1) if name in drive.channels else used[:, 0]
+        found[name] = {
+            "updates": int(used.any(axis=1).sum()),
+            "arrived": int(arrived.sum()),
+            "refused": int(refused.any(axis=1).sum()),
+            "nis_per_value": nis,
+        }
+    return found
 
 
 def _east_north_up(values: dict[str, np.ndarray]) -> dict[str, Any]:

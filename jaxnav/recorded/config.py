@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -70,6 +71,9 @@ class FilterConfig:
         stop_gyro_dps: Angular rate that a stopped vehicle stays below [deg/s].
         stop_accel: Standard deviation of the specific force that it stays below [m/s^2].
         stop_time_s: For so long; both of means over 0.2 s.
+        carry: States to find besides, with what is known before (one sigma): lever-arm (0.5 m),
+            mounting (3 deg), time-offset (0.05 s), gyro-scale and accel-scale (0.5 %),
+            position-error (1 m, over 60 s), which fixes have beside their noise.
         gate: Whether fixes that contradict the filter are refused, and named.
         gate_false_alarm: Probability to refuse a position or a velocity though the filter is right.
         gate_patience: Refusals in a row over which the gate opens by e, in squares.
@@ -115,6 +119,7 @@ class FilterConfig:
     stop_gyro_dps: float = 0.8
     stop_accel: float = 0.06
     stop_time_s: float = 2.0
+    carry: tuple[str, ...] = ()
     gate: bool = True
     gate_false_alarm: float = 1e-9
     gate_patience: float = 5.0
@@ -136,6 +141,7 @@ ALONE: dict[str, Any] = {
     "filter": "ekf",
     "constraints": False,
     "gate": False,
+    "carry": (),
     "r_factors": (1.0,),
     "q_factors": (1.0,),
 }
@@ -176,6 +182,7 @@ def check(config: FilterConfig) -> None:
         config.outage_every_s,
         f"above outage_s, which is {config.outage_s}",
     )
+    _check_carry(config)
     _check_spans(config)
     require(config.noise_runs >= 1, "noise_runs", config.noise_runs, "at least 1")
     require(0 <= config.seed < 2**63, "seed", config.seed, "between 0 and 2**63 - 1")
@@ -199,6 +206,19 @@ def parts_of(name: str) -> tuple[str, ...]:
 def members(config: FilterConfig) -> int:
     """Return how many filters run: one, or the members of the bank."""
     return len(config.r_factors) * len(config.q_factors) * len(config.forgetting)
+
+
+def _check_carry(config: FilterConfig) -> None:
+    from jaxnav.recorded.carry import CARRIES
+
+    for name in config.carry:
+        near = get_close_matches(name, CARRIES, 1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        require(name in CARRIES, "carry", name + hint, "one of " + ", ".join(CARRIES))
+    once = len(set(config.carry)) == len(config.carry)
+    require(once, "carry", ", ".join(config.carry), "each state once")
+    seen = config.constraints or "mounting" not in config.carry
+    require(seen, "carry", "mounting", "left out without the constraints, which alone show it")
 
 
 def _check_spans(config: FilterConfig) -> None:
@@ -248,6 +268,10 @@ def _typed(name: str, kind: Any, value: Any) -> Any:
         return value
     if get_origin(kind) is tuple:
         parts = get_args(kind)
+        if parts[0] is str:
+            good = isinstance(value, list) and all(isinstance(entry, str) for entry in value)
+            require(good, name, repr(value), "a list of texts")
+            return tuple(value)
         length = None if parts[1] is Ellipsis else len(parts)
         accepted = "a list of numbers" if length is None else f"a list of {length} numbers"
         good = isinstance(value, list) and all(_is_number(entry) for entry in value)

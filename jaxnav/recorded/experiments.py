@@ -123,7 +123,7 @@ def hide_and_score(
     for name, partly in drives.items():
         obs = partly.seen_by(method.model)
         kept = run(method.filter, params, drive.inputs, obs, record=method.record).record
-        off = fix_errors(method.model, one, drive, kept.mean)["position"]
+        off = fix_errors(method.model, one, drive, kept.state)["position"]
         errors[name], runs[name] = horizontal(off)[hidden], kept
     in_window = window[hidden]
     last = np.flatnonzero(np.diff(in_window, append=-1) != 0)

@@ -22,6 +22,7 @@ from jaxnav.estimation.banks.weights import (
     markov,
     penalty,
 )
+from jaxnav.estimation.carried import Carried
 from jaxnav.estimation.filters.gated import Gate, Gated, gated
 from jaxnav.estimation.filters.sage_husa import SageHusa
 from jaxnav.estimation.register import built
@@ -38,12 +39,15 @@ from jaxnav.estimation.types import (
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
 from jaxnav.navigation.states import ErrorForm, LevelError, SinsLevel, error_form
+from jaxnav.recorded.carry import carried, laws
 from jaxnav.recorded.config import FilterConfig, members, parts_of
 from jaxnav.recorded.preparation import Drive
 from jaxnav.studies.base import ConfigError
 from jaxnav.units import DEG, GRAVITY
 
 ERRORS: dict[str, LevelError] = {"liekf": "left-invariant", "se23-ekf": "right-invariant"}
+STATES = 15
+"""Tangent coordinates of the model's own state; what is carried comes after."""
 NOISE_RANGE = (0.1, 1e6)
 """Variance over the nominal that a Sage-Husa filter may estimate: RTK to hundreds of metres."""
 
@@ -72,6 +76,8 @@ class Kept(NamedTuple):
     Attributes:
         mean: The state.
         sigma: ``(15,)`` standard deviations in additive errors.
+        carried: States that are carried besides, by name.
+        carried_sigma: ``(k,)`` their standard deviations.
         nis: Normalised innovation squared.
         parts: By channel of the model, what the update told of it.
         flags: Sum of :class:`~jaxnav.estimation.types.Flag`.
@@ -81,11 +87,18 @@ class Kept(NamedTuple):
 
     mean: SinsLevel
     sigma: Array
+    carried: dict[str, Array]
+    carried_sigma: Array
     nis: Array
     parts: dict[str, ChannelInfo]
     flags: Array
     log_likelihood: Array
     weights: Array
+
+    @property
+    def state(self) -> Any:
+        """The state of the model, with what it carries."""
+        return Carried(self.mean, self.carried) if self.carried else self.mean
 
 
 def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> Method:
@@ -99,7 +112,7 @@ def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> 
     error: LevelError = ERRORS.get(config.filter, "additive")
     about = tuple(np.asarray(origin).tolist()) if error == "right-invariant" else (0.0, 0.0, 0.0)
     weighed = config.rule if members(config) > 1 else None
-    return _method(config.filter, weighed, config.gate, error, about, constrained)
+    return _method(config.filter, weighed, config.gate, error, about, constrained, config.carry)
 
 
 @cache
@@ -110,10 +123,11 @@ def _method(
     error: LevelError,
     about: tuple[float, ...],
     constrained: bool,
+    carry: tuple[str, ...],
 ) -> Method:
     """Return a method; another call finds it and with it the programs compiled for it."""
     origin = jnp.array(about)
-    model = vehicle(error, origin, constrained=constrained)
+    model = vehicle(error, origin, constrained=constrained, carry=laws(carry))
     one, form = member(name, model), error_form(error, origin)
     chosen = one if weighed is None else bank(one, rule(weighed))
     if gate:
@@ -121,11 +135,17 @@ def _method(
 
     def record(state: Any, info: Info) -> Kept:
         estimate = chosen.estimate(state)
-        own = state.inner if gate else state
-        weights = jnp.zeros(0) if weighed is None else jnp.exp(own.log_weights)
+        banked = state.inner if gate else state
+        weights = jnp.zeros(0) if weighed is None else jnp.exp(banked.log_weights)
+        whole = estimate.mean
+        mean, besides = (whole.own, whole.carried) if carry else (whole, {})
+        own = Gaussian(mean, estimate.cov[:STATES, :STATES])
+        left = jnp.diag(estimate.cov)[STATES:]
         return Kept(
-            estimate.mean,
-            additive_sigma(form, estimate),
+            mean,
+            additive_sigma(form, own),
+            besides,
+            jnp.sqrt(jnp.maximum(left, 0)),
             info.nis,
             {name: model.part(info, name) for name, _ in model.channels},
             info.flags,
@@ -242,11 +262,14 @@ def _ungated(
     names = parts_of(config.filter)
     one = one._replace(own=_own(names, jnp.array(config.forgetting[0])))
     if members(config) == 1:
-        return _scaled(one, jnp.array(config.r_factors[0]), jnp.array(config.q_factors[0]))
+        factors = jnp.array(config.r_factors[0]), jnp.array(config.q_factors[0])
+        return carried(_scaled(one, *factors), config.carry)
     grid = jnp.array(grid_of(config))
     several = replicate(one, len(grid))
     several = several._replace(own=jax.vmap(partial(_own, names))(grid[:, 2]))
-    several = jax.vmap(_scaled)(several, grid[:, 0], grid[:, 1])
+    several = jax.vmap(lambda one, r, q: carried(_scaled(one, r, q), config.carry))(
+        several, grid[:, 0], grid[:, 1]
+    )
     period = float(np.median(np.asarray(drive.inputs.inertial.dt)))
     return BankParams(several, rule_params(config, period))
 

@@ -89,8 +89,8 @@ def trajectory_arrays(drive: Drive, kept: Kept, members: list[str]) -> dict[str,
 
     ``time``, ``dcm`` (3, 3), ``velocity``, ``position`` (geodetic), ``gyro_drift``, ``accel_bias``
     (3,), ``sigma`` (15,) in additive errors, ``nis``, ``channels`` (how many were valid),
-    ``stopped``, ``innovation`` and ``innovation_sigma`` (6,), ``fix_step`` (F,), and of a bank
-    ``weights`` (M,) and ``member`` (M,).
+    ``stopped``, ``innovation`` and ``innovation_sigma`` (6,), ``fix_step`` (F,), of a bank
+    ``weights`` (M,) and ``member`` (M,), and what is carried by name with ``carried_sigma`` (k,).
     """
     arrays = {
         "time": drive.time,
@@ -107,6 +107,9 @@ def trajectory_arrays(drive: Drive, kept: Kept, members: list[str]) -> dict[str,
         "innovation_sigma": np.hstack([kept.parts[name].sigma for name in FIXES]),
         "fix_step": drive.fix_step,
     }
+    if kept.carried:
+        arrays |= {name: np.asarray(values) for name, values in kept.carried.items()}
+        arrays["carried_sigma"] = np.asarray(kept.carried_sigma)
     if members:
         arrays |= {"weights": np.asarray(kept.weights), "member": np.array(members)}
     return arrays

@@ -12,8 +12,7 @@ from jaxnav.compiling import compiled
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.types import Model
 from jaxnav.navigation.earth import displaced
-from jaxnav.navigation.models.vehicle import FIXES, VehicleInput, VehicleParams
-from jaxnav.navigation.states import SinsLevel
+from jaxnav.navigation.models.vehicle import FIXES, VehicleInput
 from jaxnav.numerics.masks import runs_of
 from jaxnav.recorded.methods import Kept
 from jaxnav.recorded.motion import offsets, since_start
@@ -56,9 +55,7 @@ class ReferenceErrors(NamedTuple):
     receiver_offset: np.ndarray
 
 
-def fix_errors(
-    model: Model, params: VehicleParams, drive: Drive, mean: SinsLevel
-) -> dict[str, np.ndarray]:
+def fix_errors(model: Model, params: Any, drive: Drive, mean: Any) -> dict[str, np.ndarray]:
     """Return what the estimates are off from the fixes: "velocity" [m/s] and "position" [m].
 
     Each ``(F, 3)``, east, north, up, computed minus measured, of the antenna at the time of the
@@ -68,7 +65,7 @@ def fix_errors(
         model: The model.
         params: Its parameters, those of any member of a bank.
         drive: The drive.
-        mean: Estimates, leading axis T.
+        mean: Estimates with what they carry, leading axis T.
     """
     at = jnp.asarray(drive.fix_step)
     given = (mean, drive.inputs, drive.seen_by(model))
@@ -79,10 +76,8 @@ def fix_errors(
 
 
 @compiled(static_argnums=0)
-def _against(
-    model: Model, params: VehicleParams, x: SinsLevel, u: VehicleInput, z: Array
-) -> dict[str, Array]:
-    def one(x: SinsLevel, u: VehicleInput, z: Array) -> dict[str, Array]:
+def _against(model: Model, params: Any, x: Any, u: VehicleInput, z: Array) -> dict[str, Array]:
+    def one(x: Any, u: VehicleInput, z: Array) -> dict[str, Array]:
         off = -model.residual(z, model.observe(params, x, u))
         return {name: off[model.channel(name)] for name in FIXES}
 

@@ -40,6 +40,12 @@ def print_filter(document: dict[str, Any], directory: Path, figures: list[Path])
     )
     turned = ", ".join(f"{angle:.2f}" for angle in start["mounting_deg"])
     console.print(f"mounting {start['mounting']}: {turned} deg", soft_wrap=True)
+    for name, found in document["carried"].items():
+        values = ", ".join(
+            f"{value:.3g} +- {sigma:.2g}"
+            for value, sigma in zip(found["value"], found["sigma"], strict=True)
+        )
+        console.print(f"{name} found: {values} {found['unit']}", soft_wrap=True)
     print_findings(console, document["audit"])
     if document["refused"]:
         shown = ", ".join(
