@@ -82,6 +82,7 @@ if TYPE_CHECKING:
         linearised_at_truth as linearised_at_truth,
     )
     from jaxnav.estimation.bounds import oracle as oracle
+    from jaxnav.estimation.carried import carrying as carrying
     from jaxnav.estimation.filters.adaptive import (
         innovation_adaptive as innovation_adaptive,
     )
@@ -148,6 +149,7 @@ if TYPE_CHECKING:
     from jaxnav.estimation.types import (
         replicate as replicate,
     )
+    from jaxnav.numerics.discretise import discretise as discretise
 
 _HOMES = {
     "jaxnav.estimation.banks.imm": ("imm", "imm_params", "uniform_switching"),
@@ -171,6 +173,7 @@ _HOMES = {
     ),
     "jaxnav.estimation.banks.reset": ("WindowedReset", "windowed_reset"),
     "jaxnav.estimation.bounds": ("linearised_at_truth", "oracle"),
+    "jaxnav.estimation.carried": ("carrying",),
     "jaxnav.estimation.filters.adaptive": ("innovation_adaptive",),
     "jaxnav.estimation.filters.gated": ("Gate", "Gated", "gated"),
     "jaxnav.estimation.filters.iterated": (
@@ -205,6 +208,7 @@ _HOMES = {
         "observed",
         "replicate",
     ),
+    "jaxnav.numerics.discretise": ("discretise",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -23,6 +23,7 @@ ORDER = (
     "numerics.ode",
     "numerics.masks",
     "numerics.sequences",
+    "numerics.discretise",
     "estimation.types",
     "estimation.models",
     "estimation.carried",
