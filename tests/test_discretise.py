@@ -51,7 +51,7 @@ def test_random_systems_equal_van_loan() -> None:
 
 
 def test_whole_numbers_are_numbers_too() -> None:
-    Phi, Q = jn.discretise([[0, 1], [0, 0]], [[0], [1]], [2], 3)
+    Phi, Q = jn.discretise(np.array([[0, 1], [0, 0]]), np.array([[0], [1]]), np.array([2]), 3)
     np.testing.assert_allclose(Phi, [[1, 3], [0, 1]], rtol=1e-13)
     np.testing.assert_allclose(Q, [[18, 9], [9, 6]], rtol=1e-13)
     narrow = jn.discretise(jnp.eye(2, dtype=jnp.float32), None, jnp.ones(2, jnp.float32), 0.1)
