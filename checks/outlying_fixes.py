@@ -13,7 +13,7 @@ quarter of an hour on two cores.
 import json
 import sys
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -70,18 +70,16 @@ def main() -> int:
     from jaxnav.cli import configure_jax
     from jaxnav.datasets.formats import load_drive
     from jaxnav.recorded.analysis import analyse
-    from jaxnav.recorded.config import FilterConfig, FilterName
+    from jaxnav.recorded.config import ALIASES, FilterConfig
 
-    known: tuple[Any, ...] = get_args(FilterName)
-    folder = next(iter(sys.argv[1:]), "")
-    names: list[Any] = sys.argv[2:]
-    if not folder or set(names) - set(known):
-        print(f"usage: python checks/outlying_fixes.py FOLDER [{'|'.join(known)} ...]")
+    folder, names = next(iter(sys.argv[1:]), ""), sys.argv[2:]
+    if not folder:
+        print("usage: python checks/outlying_fixes.py FOLDER [FILTER ...]")
         return 2
     configure_jax()
     log = load_drive(Path(folder))
     result: dict[str, Any] = json.loads(RECORD.read_text()) if RECORD.exists() else {}
-    for name in names or known:
+    for name in names or ("ekf", "ukf", *ALIASES):
         config = FilterConfig(filter=name, outages="off", rate_hz=25.0)
         clean = analyse(log, config)
         at = places(clean.drive)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from checks import wheel_speed
 from jaxnav.compiling import compiled
 from jaxnav.estimation.carried import Carried, CarriedParams, carrying, random_walk, with_carried
 from jaxnav.estimation.filters.kalman import ekf
@@ -116,3 +117,18 @@ def test_the_barometer_of_a_recorded_rocket_finds_its_apogee() -> None:
     published = np.argmax(own[1])
     assert abs(height[top] - own[1, published]) < 40
     assert abs(time[top] - own[0, published]) < 1.5
+
+
+SEGMENT = wheel_speed.SEGMENT
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SEGMENT.exists(), reason="the recorded segment is not in ../shared/data")
+def test_wheel_speeds_halve_the_error_of_a_recorded_drive_without_fixes() -> None:
+    """A sample of `checks/wheel_speed.py`; its scale is that of the reference within 2 %."""
+    found = wheel_speed.measured(SEGMENT, every_s=20.0)
+    assert len(found["windows"]) == 2
+    assert found["rms_m"]["wheels too"] < 0.5 * found["rms_m"]["constraints"]
+    last = found["windows"][-1]
+    assert abs(last["scale"] - found["scale_of_the_reference"]) < 0.02
+    assert last["scale_sigma"] < 0.002
