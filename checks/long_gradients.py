@@ -61,9 +61,9 @@ def faults(name: str, found: Slopes) -> list[str]:
 
 def main() -> int:
     """Compare all and write what was found."""
+    jax.config.update("jax_enable_x64", True)
     from tests.gradient_cases import CASES
 
-    jax.config.update("jax_enable_x64", True)
     record, failed = {}, False
     for name in CASES:
         found = compared(name)

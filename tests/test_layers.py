@@ -1,6 +1,8 @@
 """The order of dependence: a module imports only from the layers below it."""
 
 import ast
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -300,6 +302,19 @@ def test_the_library_leaves_the_configuration_of_jax_alone() -> None:
             if isinstance(node, ast.Call)
         ]
         assert name == "cli" or "jax.config.update" not in calls, name
+
+
+def test_imports_start_no_backend_and_make_no_array() -> None:
+    """Else 64 bits that are switched on after an import would find arrays of 32."""
+    names = [name for name in modules() if not name.endswith("__main__")]
+    code = (
+        "import importlib, sys; from jax._src import xla_bridge\n"
+        "for name in sys.argv[1:]:\n"
+        "    importlib.import_module(f'jaxnav.{name}')\n"
+        "    assert not xla_bridge.backends_are_initialized(), name\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-500:]
 
 
 def test_public_names_exist_and_are_few() -> None:

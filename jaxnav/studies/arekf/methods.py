@@ -31,7 +31,6 @@ SHARED = ("ekf", "mmae", "arekf", "oracle")
 """Methods that are weight rules over one set of members."""
 AXES = ("east", "north", "up")
 KINDS = ("attitude", "velocity", "position")
-ORIGIN = jnp.array([ArcProfile().latitude, ArcProfile().longitude, 0.0])
 
 
 class Setup(NamedTuple):
@@ -114,15 +113,20 @@ def filters() -> dict[str, Filter]:
     rules = {name: bayes() if name == "mmae" else fixed() for name in SHARED}
     return {
         "panel": panel(ekf(plain), rules),
-        **{name: ekf(sins_gnss(form, ORIGIN)) for name, form in FORMS.items()},
+        **{name: ekf(sins_gnss(form, _origin())) for name, form in FORMS.items()},
         "versoria-ekf": versoria(ekf(plain)),
         "iae": innovation_adaptive(ekf(plain)),
     }
 
 
+def _origin() -> Array:
+    """Return the launch point, about which the right-invariant error turns."""
+    return jnp.array([ArcProfile().latitude, ArcProfile().longitude, 0.0])
+
+
 def form_of(name: str) -> ErrorForm:
     """Return the definition of the error of a method."""
-    return error_form(FORMS.get(name, "additive"), ORIGIN)
+    return error_form(FORMS.get(name, "additive"), _origin())
 
 
 def params_of(name: str, flight: Run, shared: Shared, scales: Sequence[float]) -> Any:
@@ -223,7 +227,7 @@ def judge(
     Errors are additive ones, the NEES is that of the filter's own.
     """
     truth, count = flight.truth, estimates.cov.shape[0]
-    error = jax.vmap(error_form("additive", ORIGIN).local)(truth, estimates.mean)
+    error = jax.vmap(error_form("additive", _origin()).local)(truth, estimates.mean)
     blocks = error[:, : LAYOUT.eps.start].reshape(count, 3, 3)
     variances = _additive_variances(form, estimates).reshape(count, 3, 3)
     # The error in the filter's own coordinates, from the estimate, whose tangent space P is in.
