@@ -121,7 +121,7 @@ def filters() -> dict[str, Filter]:
 
 def _origin() -> Array:
     """Return the launch point, about which the right-invariant error turns."""
-    return jnp.array([ArcProfile().latitude, ArcProfile().longitude, 0.0])
+    return host.array([ArcProfile().latitude, ArcProfile().longitude, 0.0])
 
 
 def form_of(name: str) -> ErrorForm:
