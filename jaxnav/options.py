@@ -82,13 +82,17 @@ def spread(arguments: list[str], flag: str) -> list[str]:
     found, listing = [], False
     for argument in arguments:
         if argument.startswith(f"{flag}="):
-            found += [flag, *argument.removeprefix(f"{flag}=").split(",")]
+            found += [flag, *_apart(argument.removeprefix(f"{flag}="))]
         elif listing and not argument.startswith("-"):
-            found += argument.split(",")
+            found += _apart(argument)
         else:
             found.append(argument)
             listing = argument == flag
     return found
+
+
+def _apart(listed: str) -> list[str]:
+    return [name.strip() for name in listed.split(",") if name.strip()]
 
 
 def _value_of(flag: str, arguments: list[str]) -> str | None:

@@ -224,7 +224,16 @@ def test_the_field_of_the_earth_is_the_published_one() -> None:
         np.testing.assert_allclose(magnetic_field(place, 2020.0), [east, north, -down], atol=0.06)
 
 
+HARD = Carried(STATE, {"hard_iron": jnp.zeros(1)})
 MISUSE: dict[str, tuple[Callable[[], object], str]] = {
+    "a carried state of another size": (
+        lambda: magnetometer().observe(CASES["magnetometer"][1], HARD, None),
+        "the carried state 'hard_iron' is (1,); it must be (3,)",
+    ),
+    "one beacon as a vector": (
+        lambda: ranges(1).observe(Beacons(STATE.position, jnp.ones(1), jnp.zeros(3)), STATE, None),
+        "the beacons' positions are (3,); they must be (1, 3)",
+    ),
     "a year without a model": (lambda: magnetic_field(P, 1990.0), "1990"),
 }
 

@@ -50,9 +50,9 @@ LAW_PARAMS = {
 
 def by_hand() -> Model:
     keep = np.exp(-DT / TIME)
-    Phi = jax.scipy.linalg.block_diag(F, jnp.eye(2), jnp.array([[keep]]))
-    Q = np.diag([0.01, 0.01, WALK**2 * DT, 4 * WALK**2 * DT, SIGMA**2 * (1 - keep**2)])
-    row = jnp.array([[1.0, 0.5, 0.0, 0.0, 1.0]])
+    Phi = jax.scipy.linalg.block_diag(F, jnp.array([[keep]]), jnp.eye(2))
+    Q = np.diag([0.01, 0.01, SIGMA**2 * (1 - keep**2), WALK**2 * DT, 4 * WALK**2 * DT])
+    row = jnp.array([[1.0, 0.5, 1.0, 0.0, 0.0]])
     return Model(
         lambda p, x, u: Phi @ x,
         lambda p, x, u: jnp.asarray(Q),
@@ -74,14 +74,14 @@ def test_a_process_that_carries_states_is_the_wide_one_by_hand() -> None:
             "bias": (jnp.array([0.1]), jnp.array([[0.5]])),
         },
     )
-    wide = FilterParams((), Gaussian(jnp.array([0.3, -0.2, 0, 0, 0.1]), initial.cov))
+    wide = FilterParams((), Gaussian(jnp.array([0.3, -0.2, 0.1, 0, 0]), initial.cov))
     final = run(ekf(by_hand()), wide, None, obs).record[0]
     params = FilterParams(CarriedParams(jnp.array(0.01), LAW_PARAMS), initial)
     for line in (LINE, LINE._replace(differential=None)):
         model = observing(WIDE, {"line": line}, parts=shared)
-        assert model.carried == (("scale", 2), ("bias", 1))
+        assert model.carried == (("bias", 1), ("scale", 2))
         ours = run(ekf(model), params, None, obs).record[0]
-        flat = jnp.hstack([ours.mean.own, ours.mean.scale, ours.mean.bias])
+        flat = jnp.hstack([ours.mean.own, ours.mean.bias, ours.mean.scale])
         np.testing.assert_allclose(flat, final.mean, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(ours.cov, final.cov, rtol=1e-12, atol=1e-14)
 
@@ -199,6 +199,19 @@ def test_a_lever_arm_is_found_in_turns_and_not_where_it_cannot_be_seen() -> None
 
 
 NONE: dict[str, Law] = {}
+WRONG: Any = 1.0
+STATE = Carried(jnp.ones(2), {"scale": jnp.ones(2), "bias": jnp.ones(1)})
+
+
+def run_from(initial: Any, own: Any = None) -> Any:
+    """Run a filter of a model that carries a scale and a bias."""
+    params = CarriedParams(jnp.array(0.01), LAW_PARAMS) if own is None else own
+    model = observing(WIDE, {"line": LINE}, parts=shared)
+    obs = Obs(jnp.ones((3, 1)), jnp.ones((3, 1), bool))
+    return run(ekf(model), FilterParams(params, initial), None, obs)
+
+
+START = Gaussian(jnp.zeros(2), jnp.eye(2))
 MISUSE: dict[str, tuple[Callable[[], object], str]] = {
     "none": (lambda: carrying(OWN, NONE, period=1.0), "there is no state to carry"),
     "twice": (lambda: carrying(WIDE, {"bias": constant(1)}, period=1.0), "'bias' is carried twice"),
@@ -224,6 +237,58 @@ MISUSE: dict[str, tuple[Callable[[], object], str]] = {
         ),
         "the process has a state 'bias' itself",
     ),
+    "a field of the state below another": (
+        lambda: carrying(
+            carrying(OWN, {"a": constant(1)}, period=1.0), {"position": constant(1)}, period=1.0
+        ).transition(
+            CarriedParams(CarriedParams((), {"a": ()}), {"position": ()}),
+            Carried(
+                Carried(sins_gnss.SinsLevel(*[jnp.zeros(3)] * 5), {"a": jnp.zeros(1)}),
+                {"position": jnp.zeros(1)},
+            ),
+            None,
+        ),
+        "the process has a state 'position' itself",
+    ),
+    "a start that carries nothing": (lambda: run_from(START), "is Carried(own, {name: state})"),
+    "a start that lacks one": (
+        lambda: run_from(with_carried(START, {"bias": (jnp.zeros(1), jnp.ones(1))})),
+        "the state lacks the carried 'scale'",
+    ),
+    "plain parameters": (
+        lambda: WIDE.transition(WRONG, STATE, None),
+        "a process that carries states takes CarriedParams(own, {name",
+    ),
+    "parameters of another state": (
+        lambda: WIDE.transition(
+            CarriedParams(jnp.array(0.1), {**LAW_PARAMS, "c": ()}), STATE, None
+        ),
+        "there are parameters of 'c', which is not carried",
+    ),
+    "a scalar mean": (
+        lambda: with_carried(START, {"bias": (jnp.array(0.0), jnp.ones(1))}),
+        "the mean of 'bias' is (); it must be (k,)",
+    ),
+    "a variance of another size": (
+        lambda: with_carried(START, {"bias": (jnp.zeros(2), jnp.ones(3))}),
+        "the variance of 'bias' is (3,); it must be (2,) or (2, 2)",
+    ),
+    "a model": (
+        lambda: carrying(WRONG, {"bias": constant(1)}, period=1.0),
+        "carrying takes a Process, of a model process_of(model)",
+    ),
+    "a law without its size": (
+        lambda: carrying(OWN, {"bias": WRONG}, period=1.0),
+        "it must be a Law, as constant(3) is",
+    ),
+    "a negative period": (
+        lambda: carrying(OWN, {"bias": constant(1)}, period=-1.0),
+        "period is -1.0; it must be zero or more",
+    ),
+    "a list to carry": (
+        lambda: sins_gnss.sins_gnss(carry=["lever_arm"]),  # pyright: ignore[reportArgumentType]
+        "carry must be a mapping of names to laws",
+    ),
     "a channel of a model again": (
         lambda: observing(sins_gnss.sins_gnss(), {"position": LINE}),
         "two channels 'position'",
@@ -245,6 +310,14 @@ def test_misuse_is_refused_in_one_sentence(name: str) -> None:
     with pytest.raises(ValueError, match=re.escape(sentence)) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_the_order_of_names_does_not_matter() -> None:
+    parts = {"scale": (jnp.zeros(2), jnp.array([1.0, 2.0])), "bias": (jnp.zeros(1), jnp.ones(1))}
+    orders = parts.items(), reversed(parts.items())
+    one, other = (with_carried(START, dict(order)) for order in orders)
+    np.testing.assert_array_equal(one.cov, other.cov)
+    np.testing.assert_array_equal(np.diag(one.cov), [1, 1, 1, 1, 2])
 
 
 def test_channels_are_added_to_a_model_whose_own_go_on() -> None:

@@ -54,6 +54,8 @@ def test_whole_numbers_are_numbers_too() -> None:
     Phi, Q = jn.discretise(np.array([[0, 1], [0, 0]]), np.array([[0], [1]]), np.array([2]), 3)
     np.testing.assert_allclose(Phi, [[1, 3], [0, 1]], rtol=1e-13)
     np.testing.assert_allclose(Q, [[18, 9], [9, 6]], rtol=1e-13)
+    flags = np.array([[False, True], [False, False]])
+    assert jn.discretise(flags, None, np.ones(2), 0.5).Phi[0, 1] == 0.5
     narrow = jn.discretise(jnp.eye(2, dtype=jnp.float32), None, jnp.ones(2, jnp.float32), 0.1)
     assert narrow.Phi.dtype == narrow.Q.dtype == jnp.float32
 
@@ -93,6 +95,10 @@ def test_derivatives_in_both_modes() -> None:
     [
         ((np.ones((2, 3)), None, np.ones(2), 1.0), "F is (2, 3); it must be square, (n, n)"),
         ((np.ones(3), None, np.ones(2), 1.0), "F is (3,); it must be square, (n, n)"),
+        ((np.eye(2), None, np.ones(2), np.array([0.1, 0.2])), "dt is (2,); it must be one number"),
+        ((1j * np.eye(2), None, np.ones(2), 1.0), "F is complex; it must be of real numbers"),
+        ((np.eye(2), None, np.ones(2), -0.1), "dt is -0.1; it must not be negative"),
+        ((np.eye(2), None, -np.ones(2), 0.1), "a variance of Qc is -1; it must not be negative"),
         ((np.eye(2), np.ones((3, 1)), np.ones(1), 1.0), "it must be (2, k)"),
         ((np.eye(2), np.ones((2, 1)), np.ones(2), 1.0), "it must be (1, 1) or (1,)"),
     ],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxnav.estimation.filters.kalman import ekf
-from jaxnav.estimation.models import Channel, ModelParams, Process, observing, shared
+from jaxnav.estimation.models import Channel, ModelParams, Process, measured, observing, shared
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs
 
@@ -63,6 +63,18 @@ NOT_ONE: Any = PROCESS
 LONG = LINE._replace(size=2)
 SEEN = Obs(jnp.ones((2, 3)), jnp.ones((2, 3), bool))
 MISUSE = {
+    "a list of channels": (
+        lambda: observing(PROCESS, [LINE]),  # pyright: ignore[reportArgumentType]
+        "must be a mapping of names to channels",
+    ),
+    "a filter for a process": (
+        lambda: observing(ekf(WHOLE), {"a": LINE}),  # pyright: ignore[reportArgumentType]
+        "process is Filter; observing takes a Process, or a Model",
+    ),
+    "a model to be measured": (
+        lambda: measured(jax.random.key(0), NOT_ONE, (), jnp.ones((3, 2)), None),
+        "channel is Process; it must be a Channel",
+    ),
     "no channel": (lambda: observing(PROCESS), "there is no channel"),
     "two of one name": (lambda: observing(PROCESS, {"a": LINE}, {"a": BENT}), "two channels 'a'"),
     "the name of the process": (lambda: observing(PROCESS, {"process": LINE}), "named 'process'"),

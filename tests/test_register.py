@@ -10,6 +10,7 @@ import pytest
 from jaxnav.cli import BAD_INPUT, OK, main
 from jaxnav.estimation import register
 from jaxnav.estimation.register import BANK, FILTER, RULE, WRAPPER, by_kind, chain_of, load
+from jaxnav.navigation.models.kinematic import constant_velocity
 from jaxnav.recorded.config import ALIASES, FilterConfig, parts_of
 from jaxnav.studies.base import ConfigError
 
@@ -65,8 +66,9 @@ def test_every_filter_of_the_library_may_be_asked_for() -> None:
     [
         ("ekff", "filter is 'ekff', but there is none of 'ekff', did you mean 'ekf'?"),
         ("versorai(ekf)", "there is none of 'versorai', did you mean 'versoria'?"),
-        ("ekf(ekf)", "there is none of 'ekf'"),
-        ("versoria", "there is none of 'versoria'"),
+        ("ekf(ekf)", "ekf is one of the filters; it can only stand innermost, as versoria(ekf)"),
+        ("versoria", "versoria is one of the wrappers; it needs a filter inside, as versoria(ekf)"),
+        ("mmae", "but mmae is one of the banks"),
         ("versoria(ekf, 3)", "it is not of that form"),
         ("versoria(iterations=3)", "it is not of that form"),
         ("ekf)", "it is not of that form"),
@@ -94,6 +96,11 @@ FILES = {
     "not Python": ("def (", "stops with SyntaxError"),
     "fails": ("1 / 0\n", "stops with ZeroDivisionError: division by zero"),
     "nothing in it": ("def helper(x: int) -> int:\n    return x\n", "has no filter, wrapper or"),
+    "an exit": ("raise SystemExit(3)\n", "stops with SystemExit"),
+    "types that are not there": (
+        "def half(filter: 'Nothing') -> 'Nothing':\n    return filter\n",
+        "the types of half cannot be read: name 'Nothing' is not defined",
+    ),
     "a name that is taken": (
         "from jaxnav.estimation.types import Filter\n\n\n"
         "def versoria(filter: Filter) -> Filter:\n    return filter\n",
@@ -115,6 +122,22 @@ def test_files_that_cannot_be_used_are_refused(
     assert sentence in said
     assert said.count("\n") == 1
     assert "versoria" in by_kind()[WRAPPER]
+
+
+def test_what_makes_no_filter_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "own.py"
+    head = "from jaxnav.estimation.types import Filter\n\n\n"
+    path.write_text(
+        head
+        + "def nothing(filter: Filter) -> Filter:\n    pass\n\n\n"
+        + "def needs(filter: Filter, *, k: int) -> Filter:\n    return filter\n"
+    )
+    assert load(path) == ["nothing", "needs"]
+    model = constant_velocity(1)
+    with pytest.raises(ValueError, match=r"^nothing returns NoneType; it must return a Filter$"):
+        register.built(("nothing", "ekf"), model)
+    with pytest.raises(ValueError, match=r"^needs stops with TypeError: needs"):
+        register.built(("needs", "ekf"), model)
 
 
 def test_a_file_is_loaded_once() -> None:

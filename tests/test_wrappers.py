@@ -213,6 +213,34 @@ MISUSE: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: versoria(bank(ekf(MODEL), bayes())),
         r"^versoria hands noise to the model of a single filter, and a bank has one for each",
     ),
+    "a place that is none": (
+        lambda: gated(ekf(MODEL), [[7]]),
+        r"^groups has the place 7; it must be whole, from 0 to 2$",
+    ),
+    "a negative place": (
+        lambda: gated(ekf(MODEL), [[1, -1]]),
+        r"^groups has the place -1; it must be whole, from 0 to 2$",
+    ),
+    "a name for a list of them": (
+        lambda: gated(ekf(MODEL), "first"),
+        r"^groups is 'first'; it must be a list of names or of places$",
+    ),
+    "a builder behind a gate": (
+        lambda: gated(WRONG),
+        r"^filter is 3; it must be a Filter",
+    ),
+    "bounds the wrong way round": (
+        lambda: ran(
+            sage_husa(ekf(MODEL)),
+            params(SageHusa(low=10.0, high=1.0), ()),
+            jnp.asarray(data()[0]),
+        ),
+        r"^low of SageHusa is 10 and high 1; low must not be above high$",
+    ),
+    "half an iteration": (
+        lambda: versoria(ekf(MODEL), iterations=WRONG / 2),
+        r"^iterations is 1\.5; a robust update needs 1 or more, and whole$",
+    ),
     "a builder without its model": (
         lambda: sage_husa(ekf),
         r"^filter is the function ekf; sage_husa takes a filter, as ekf\(model\)$",

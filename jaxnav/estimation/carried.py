@@ -5,7 +5,7 @@
     start = with_carried(start, {"barometer_bias": (zeros(1), variance)})
 
 Carried states move by laws of their own. The tangent space has the coordinates of the process, then
-those of the carried states in order.
+those of the carried states in the order of their names.
 """
 
 import keyword
@@ -130,7 +130,16 @@ def carrying(
         ValueError: If there is no state, one is carried twice, its name is no name for an attribute
             or its size is below one; in a run, if the process has a state of that name itself.
     """
+    if not isinstance(process, Process):
+        raise ValueError(
+            f"process is {type(process).__name__}; carrying takes a Process, of a model "
+            "process_of(model)"
+        )
     _check_names(process, states)
+    if not callable(period) and not period >= 0:
+        raise ValueError(f"period is {period}; it must be zero or more")
+    # As a tree of JAX has them: then no order in which they are named can be a wrong one.
+    states = dict(sorted(states.items()))
     total = sum(law.size for law in states.values())
     step = period if callable(period) else lambda u: jnp.asarray(period)
     corrected = inputs or (lambda carried, u: u)
@@ -138,9 +147,6 @@ def carrying(
     def laws(params: CarriedParams, u: Input, what: str) -> Array:
         """Return a property of all laws, laid out as in the tangent space."""
         dt = jnp.maximum(step(u), 0)
-        lacking = [name for name in states if name not in params.carried]
-        if lacking:
-            raise ValueError(f"there are no parameters of the carried state {lacking[0]!r}")
         found = [
             jnp.broadcast_to(getattr(law, what)(params.carried[name], dt), (law.size,))
             for name, law in states.items()
@@ -158,7 +164,8 @@ def carrying(
         return jnp.concatenate([carried[name] for name in states])
 
     def moved_own(params: CarriedParams, x: Carried, u: Input) -> Point:
-        taken = set(getattr(x.own, "_fields", ())) & set(states)
+        _check_params(params, states)
+        taken = _fields_of(x.own) & set(states)
         if taken:
             raise ValueError(f"the process has a state {min(taken)!r} itself; carry another name")
         return process.transition(params.own, x.own, corrected(x.carried, u))
@@ -175,6 +182,7 @@ def carrying(
         return Carried(process.retract(x.own, dx[:rest]), split(flat(x.carried) + dx[rest:]))
 
     def local(x: Carried, y: Carried) -> Array:
+        _check_state(x, states)
         return jnp.concatenate([process.local(x.own, y.own), flat(y.carried) - flat(x.carried)])
 
     def differential(params: CarriedParams, x: Carried, u: Input) -> Differential | None:
@@ -210,8 +218,12 @@ def with_carried(initial: Gaussian, states: Mapping[str, tuple[Array, Array]]) -
     Args:
         initial: Of the process.
         states: Mean ``(k,)`` and variance, a covariance ``(k, k)`` or its diagonal ``(k,)``, by
-            name, in the order in which they are carried.
+            name.
+
+    Raises:
+        ValueError: If a mean is no vector, or its variance has another size.
     """
+    states = {name: _known_before(name, *entry) for name, entry in sorted(states.items())}
     wide = [cov if jnp.ndim(cov) == 2 else jnp.diag(cov) for _, cov in states.values()]
     mean = Carried(initial.mean, {name: jnp.asarray(value) for name, (value, _) in states.items()})
     return Gaussian(mean, jax.scipy.linalg.block_diag(initial.cov, *wide))
@@ -227,6 +239,8 @@ def check_carried(states: Mapping[str, Law], known: Mapping[str, int]) -> None:
     Raises:
         ValueError: If one that is known has another size, or an unknown name is nearly a known one.
     """
+    if not isinstance(states, Mapping):
+        raise ValueError("carry must be a mapping of names to laws, as {'lever_arm': constant(3)}")
     for name, law in states.items():
         near = get_close_matches(name, known, 1, cutoff=0.8)
         if name not in known and near:
@@ -237,16 +251,81 @@ def check_carried(states: Mapping[str, Law], known: Mapping[str, int]) -> None:
             )
 
 
+def carried_or(x: Any, name: str, size: int, default: Any) -> Any:
+    """Return a state that is carried under a name, or a default where none is.
+
+    Raises:
+        ValueError: If it is carried with another size.
+    """
+    found = getattr(x, name, None)
+    if found is None:
+        return default
+    if jnp.shape(found) != (size,):
+        raise ValueError(f"the carried state {name!r} is {jnp.shape(found)}; it must be ({size},)")
+    return found
+
+
+def _known_before(name: str, mean: Any, variance: Any) -> tuple[Array, Array]:
+    mean, variance = jnp.asarray(mean, float), jnp.asarray(variance, float)
+    k = mean.shape[0] if mean.ndim == 1 else 0
+    if k == 0:
+        raise ValueError(f"the mean of {name!r} is {mean.shape}; it must be (k,)")
+    if variance.shape not in ((k,), (k, k)):
+        raise ValueError(
+            f"the variance of {name!r} is {variance.shape}; it must be ({k},) or ({k}, {k})"
+        )
+    return mean, variance
+
+
+def _fields_of(x: Any) -> set[str]:
+    """Return the names by which parts of a state are seen."""
+    if isinstance(x, Carried):
+        return set(x.carried) | _fields_of(x.own)
+    return set(getattr(x, "_fields", ()))
+
+
+def _check_params(params: Any, states: Mapping[str, Law]) -> None:
+    if not isinstance(params, CarriedParams):
+        raise ValueError(
+            f"the parameters are {type(params).__name__}; a process that carries states takes "
+            "CarriedParams(own, {name: parameters of its law})"
+        )
+    for name in states:
+        if name not in params.carried:
+            raise ValueError(f"there are no parameters of the carried state {name!r}")
+    for name in params.carried:
+        if name not in states:
+            raise ValueError(f"there are parameters of {name!r}, which is not carried")
+
+
+def _check_state(x: Any, states: Mapping[str, Law]) -> None:
+    if not isinstance(x, Carried):
+        raise ValueError(
+            f"the state is {type(x).__name__}; one that carries {', '.join(states)} is "
+            "Carried(own, {name: state}), as with_carried makes the initial one"
+        )
+    for name, law in states.items():
+        if name not in x.carried:
+            raise ValueError(f"the state lacks the carried {name!r}")
+        if jnp.shape(x.carried[name]) != (law.size,):
+            raise ValueError(
+                f"the carried state {name!r} is {jnp.shape(x.carried[name])}; it must be "
+                f"({law.size},)"
+            )
+
+
 def _check_names(process: Process, states: Mapping[str, Law]) -> None:
     before = {name for name, _ in process.carried}
-    if not states:
+    if not states or not isinstance(states, Mapping):
         raise ValueError("there is no state to carry; name one or more, with its law")
     for name, law in states.items():
+        if not isinstance(law, Law):
+            raise ValueError(f"the law of {name!r} is {law!r}; it must be a Law, as constant(3) is")
         if name in before:
             raise ValueError(f"the state {name!r} is carried twice; carry each once")
         if not name.isidentifier() or keyword.iskeyword(name) or hasattr(Carried, name):
             raise ValueError(f"{name!r} cannot be the name of a carried state; take an attribute's")
-        if law.size < 1:
+        if not isinstance(law.size, int) or law.size < 1:
             raise ValueError(f"the carried state {name!r} has the size {law.size}; it must be >= 1")
 
 

@@ -257,6 +257,13 @@ def require_own(own: Any, kind: type | None, domains: Mapping[str, Domain] | Non
     require_fields("own", own, kind, domains or {})
 
 
+def require_ordered(low: Any, high: Any, of: str) -> None:
+    """Raise ``ValueError`` if a lower bound that is concrete is above its upper one."""
+    below, above = known(low), known(high)
+    if below is not None and above is not None and np.any(below > above):
+        raise ValueError(f"low of {of} is {below:g} and high {above:g}; low must not be above high")
+
+
 def require_transition_matrix(matrix: Any, count: int) -> None:
     """Raise ``ValueError`` unless a matrix holds the switching probabilities of a bank."""
     if not isinstance(matrix, jax.Array | np.ndarray) or np.shape(matrix) != (count, count):

@@ -165,6 +165,11 @@ def observing(
             below one, or the channels of a model have no names; in a run, if what a channel gives
             has not its size.
     """
+    if not isinstance(process, Process | Model):
+        raise ValueError(
+            f"process is {type(process).__name__}; observing takes a Process, or a Model to whose "
+            "channels others are added"
+        )
     before: tuple[tuple[str, int], ...] = ()
     blocks: dict[str, Channel] = {}
     if isinstance(process, Model):
@@ -227,16 +232,25 @@ def measured(key: Array, channel: Channel, params: Params, states: Point, inputs
         params: Its parameters.
         states: True states, leading axis ``T``.
         inputs: Inputs of the steps, leading axis ``T``; ``None`` where the channel needs none.
+
+    Returns:
+        ``(T, m)``; not a number where the noise is no covariance.
+
+    Raises:
+        ValueError: If it is no channel, or what it gives has not its size.
     """
+    if not isinstance(channel, Channel):
+        raise ValueError(f"channel is {type(channel).__name__}; it must be a Channel")
 
     def one(key: Array, x: Point, u: Input) -> Array:
         noisy = channel.noisy or NonAdditive(
             lambda params, x, v, u: channel.observe(params, x, u) + v, channel.noise
         )
-        noise = noisy.noise(params, x, u)
+        noise = jnp.asarray(noisy.noise(params, x, u), jnp.result_type(float))
         white = jax.random.normal(key, noise.shape[:1], noise.dtype)
-        v = jnp.sqrt(noise) * white if noise.ndim == 1 else semidefinite_root(noise).factor @ white
-        return noisy.observe(params, x, v, u)
+        root = semidefinite_root(jnp.diag(noise) if noise.ndim == 1 else noise)
+        v = jnp.where(root.semidefinite, root.factor, jnp.nan) @ white
+        return _sized("to be measured", channel, noisy.observe(params, x, v, u))
 
     count = jax.tree.leaves(states)[0].shape[0]
     return jax.vmap(one)(jax.random.split(key, count), states, inputs)
@@ -284,6 +298,11 @@ _OF_PARAMETERS = {
 def _merged(channels: tuple[Mapping[str, Channel], ...], taken: set[str]) -> dict[str, Channel]:
     named: dict[str, Channel] = {}
     for several in channels:
+        if not isinstance(several, Mapping):
+            raise ValueError(
+                f"the channels are {type(several).__name__}; they must be a mapping of names to "
+                "channels"
+            )
         for name, channel in several.items():
             if not isinstance(channel, Channel):
                 raise ValueError(f"channel {name!r} is {type(channel).__name__}, not a Channel")

@@ -71,7 +71,7 @@ def load(path: Path) -> list[str]:
         try:
             spec.loader.exec_module(module)
             found = list(_entries_of(module, WRAPPER))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             said = str(error).splitlines()[0] if str(error) else "no more is said"
             raise ValueError(f"{path} stops with {type(error).__name__}: {said}") from error
         if not found:
@@ -127,6 +127,14 @@ def chain_of(expression: str) -> tuple[str, ...]:
     names.append(node.id if isinstance(node, ast.Name) else "")
     for i, name in enumerate(names):
         kind = FILTER if i == len(names) - 1 else WRAPPER
+        other = next((of for of in KINDS if name in known[of]), None)
+        if other is not None and other != kind:
+            needed = f"{name}(ekf)" if other == WRAPPER else f"versoria({name})"
+            where = "needs a filter inside" if other == WRAPPER else "can only stand innermost"
+            raise ValueError(
+                f"filter is {expression!r}, but {name} is one of the {other}"
+                + (f"; it {where}, as {needed}" if other in (FILTER, WRAPPER) else "")
+            )
         if name not in known[kind]:
             near = difflib.get_close_matches(name, known[kind], 1)
             hint = f", did you mean {near[0]!r}?" if near else ""
@@ -140,12 +148,23 @@ def chain_of(expression: str) -> tuple[str, ...]:
 
 
 def built(names: tuple[str, ...], model: Model) -> Filter:
-    """Return the filter of a model that :func:`chain_of` named."""
-    known = entries()
-    filter = known[names[-1]].make(model)
-    for name in reversed(names[:-1]):
-        filter = known[name].make(filter)
-    return filter
+    """Return the filter of a model that :func:`chain_of` named.
+
+    Raises:
+        ValueError: If one of them refuses it, stops, or returns something else.
+    """
+    made: Any
+    known, made = entries(), model
+    for name in reversed(names):
+        try:
+            made = known[name].make(made)
+        except ValueError:
+            raise
+        except Exception as error:
+            raise ValueError(f"{name} stops with {type(error).__name__}: {error}") from error
+        if not isinstance(made, Filter):
+            raise ValueError(f"{name} returns {type(made).__name__}; it must return a Filter")
+    return made
 
 
 def functions_of(package: str) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
@@ -181,7 +200,10 @@ def _functions(module: ModuleType) -> Iterator[tuple[Callable[..., Any], dict[st
     for name, function in vars(module).items():
         own = inspect.isfunction(function) and function.__module__ == module.__name__
         if own and not name.startswith("_"):
-            yield function, get_type_hints(function)
+            try:
+                yield function, get_type_hints(function)
+            except Exception as error:
+                raise ValueError(f"the types of {name} cannot be read: {error}") from error
 
 
 def _entries_of(module: ModuleType, around: str) -> Iterator[Entry]:

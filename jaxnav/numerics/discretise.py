@@ -16,6 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.core import Tracer
 from jax.typing import ArrayLike
 
 DOUBLINGS, ORDER = 12, 10
@@ -43,16 +44,21 @@ def discretise(F: ArrayLike, G: ArrayLike | None, Qc: ArrayLike, dt: ArrayLike) 
         ``Phi`` and ``Q``; not a number where ``|F| dt`` is above :data:`LARGEST`.
 
     Raises:
-        ValueError: If shapes do not fit together.
+        ValueError: If shapes do not fit together, something is complex, or ``dt`` or a variance is
+            known to be negative.
     """
+    given = {"F": jnp.asarray(F), "Qc": jnp.asarray(Qc), "dt": jnp.asarray(dt)}
+    if G is not None:
+        given["G"] = jnp.asarray(G)
+    _require_real(given)
     # Whole numbers would make the fractions of a step zero.
-    whole = jnp.issubdtype(jnp.asarray(F).dtype, jnp.integer)
-    A = jnp.asarray(F, float if whole else None)
-    density = jnp.asarray(Qc, A.dtype)
+    A = given["F"]
+    A = A if jnp.issubdtype(A.dtype, jnp.floating) else A.astype(float)
+    density = given["Qc"].astype(A.dtype)
     n = A.shape[0] if A.ndim else 0
     if A.shape != (n, n) or n == 0:
         raise ValueError(f"F is {A.shape}; it must be square, (n, n)")
-    B = jnp.eye(n, dtype=A.dtype) if G is None else jnp.asarray(G, A.dtype)
+    B = jnp.eye(n, dtype=A.dtype) if G is None else given["G"].astype(A.dtype)
     if B.ndim != 2 or B.shape[0] != n:
         raise ValueError(f"G is {B.shape}; with F {A.shape} it must be ({n}, k)")
     k = B.shape[1]
@@ -77,3 +83,17 @@ def discretise(F: ArrayLike, G: ArrayLike | None, Qc: ArrayLike, dt: ArrayLike) 
     sound = jnp.max(jnp.sum(jnp.abs(A), axis=1)) * jnp.abs(h) * 2**DOUBLINGS <= LARGEST
     Phi = jnp.eye(n, dtype=A.dtype) + X
     return Discrete(*(jnp.where(sound, value, jnp.nan) for value in (Phi, 0.5 * (Q + Q.T))))
+
+
+def _require_real(given: dict[str, Array]) -> None:
+    """Raise ``ValueError`` for what is complex, several steps, and a negative step or noise."""
+    for name, value in given.items():
+        if jnp.iscomplexobj(value):
+            raise ValueError(f"{name} is complex; it must be of real numbers")
+    dt, Qc = given["dt"], given["Qc"]
+    if dt.ndim:
+        raise ValueError(f"dt is {dt.shape}; it must be one number")
+    variances = jnp.diag(Qc) if Qc.ndim == 2 else Qc
+    for name, value in {"dt": dt, "a variance of Qc": variances}.items():
+        if not isinstance(value, Tracer) and value.size and float(jnp.min(value)) < 0:
+            raise ValueError(f"{name} is {float(jnp.min(value)):g}; it must not be negative")

@@ -86,10 +86,10 @@ def told(names: Sequence[str], values: dict[str, Array], sigma: Array) -> dict[s
     Args:
         names: The states.
         values: Their last estimates by their names in the model.
-        sigma: Their standard deviations, one after the other.
+        sigma: Their standard deviations, in the order of these names.
     """
     found, first = {}, 0
-    for name in names:
+    for name in sorted(names, key=_state):
         one = CARRIES[name]
         last = first + one.law.size
         found[name] = {

@@ -11,6 +11,7 @@ import pytest
 import jaxnav as jn
 from checks.failed_banks import descend, score
 from jaxnav.compiling import compiled
+from jaxnav.estimation.models import shared
 from jaxnav.estimation.types import Flag
 from tests.cases import Noise, cases
 
@@ -120,6 +121,51 @@ def test_what_cannot_be_used_is_left_out_and_told(name: str) -> None:
     np.testing.assert_array_equal(np.flatnonzero(missing.flags & Flag.NO_OBSERVATION), [ALL])
     assert not np.any(clean.flags)
     assert np.all(np.isfinite(clean.numbers[2]))
+
+
+def ranging(observe: Any) -> jn.Model:
+    """A point that is seen itself, and by something else; it starts at the origin."""
+    process = jn.Process(lambda p, x, u: x + u, lambda p, x, u: 0.1 * jnp.eye(2))
+    seen = jn.Channel(2, lambda p, x, u: x, lambda p, x, u: jnp.ones(2))
+    other = jn.Channel(1, observe, lambda p, x, u: jnp.ones(1))
+    return jn.observing(process, {"seen": seen, "range": other}, parts=shared)
+
+
+def norm(p: Any, x: Any, u: Any) -> Any:
+    """The distance from the origin, whose derivative there is not a number."""
+    return jnp.linalg.norm(x).reshape(1)
+
+
+LINEARISING = {
+    "ekf": jn.ekf,
+    "square_root_ekf": jn.square_root_ekf,
+    "iterated_ekf": jn.iterated_ekf,
+    "versoria": lambda model: jn.versoria(jn.ekf(model)),
+    "gated": lambda model: jn.gated(jn.ekf(model)),
+}
+
+
+@pytest.mark.parametrize("name", LINEARISING)
+def test_a_derivative_that_is_not_a_number_stays_where_it_is(name: str) -> None:
+    """Of a missing channel it does not exist; of one that arrived the update is skipped."""
+    bad, good = ranging(norm), ranging(lambda p, x, u: x[:1])
+    z = {"seen": np.arange(8.0).reshape(4, 2), "range": np.ones((4, 1))}
+    prior = jn.FilterParams((), jn.Gaussian(jnp.zeros(2), jnp.eye(2)))
+    inputs = jnp.concatenate([jnp.zeros((1, 2)), jnp.ones((3, 2))])
+
+    def told(model: jn.Model, valid: Any) -> Any:
+        obs = model.stack(z, {"range": valid})
+        return jn.run(LINEARISING[name](model), prior, inputs, obs).record
+
+    (ours, info), (theirs, _) = (told(model, np.zeros(4, bool)) for model in (bad, good))
+    np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-12)
+    np.testing.assert_allclose(ours.cov, theirs.cov, rtol=1e-12)
+    assert not np.any(info.flags)
+    estimate, info = told(bad, np.arange(4) == 0)
+    assert info.flags[0] & Flag.NOT_POSITIVE_DEFINITE
+    np.testing.assert_array_equal(estimate.mean[0], 0)
+    np.testing.assert_allclose(estimate.cov[0], 1.1 * np.eye(2), rtol=1e-12)
+    assert not np.any(info.flags[1:])
 
 
 @each_case

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import POSITIVE
+from jaxnav.estimation.checks import POSITIVE, require_ordered
 from jaxnav.estimation.filters.innovation import heard_by
 from jaxnav.estimation.filters.wrapping import (
     Builder,
@@ -109,6 +109,8 @@ def innovation_adaptive(
 
     def check(params: FilterParams) -> None:
         base.check(require_wrapper(params, Adaptation(), _DOMAINS))
+        own, _ = parted(params, Adaptation())
+        require_ordered(own.low, own.high, "Adaptation")
 
     def init(params: FilterParams) -> AdaptiveState:
         _, inner = parted(params, Adaptation())

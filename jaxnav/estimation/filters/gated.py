@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxnav.estimation.checks import described, require_fields
+from jaxnav.estimation.checks import described, require_fields, require_filter
 from jaxnav.estimation.filters.innovation import nis_of
 from jaxnav.estimation.filters.wrapping import parted, require_wrapper
 from jaxnav.estimation.types import Filter, Flag, Gaussian, Info, Input, Model, Obs, Params
@@ -74,6 +74,7 @@ def gated(filter: Filter, groups: Sequence[str | Sequence[int]] | None = None) -
         Bar-Shalom, Li, Kirubarajan (2001), section 5.4, for the gate; to open it again is usual in
         flight software.
     """
+    require_filter(filter)
     places = _places(filter.model, groups)
     single = filter.on is not None
 
@@ -100,6 +101,11 @@ def gated(filter: Filter, groups: Sequence[str | Sequence[int]] | None = None) -
         plain = filter.update(own, state.inner, u, obs)
         used = plain[1].used
         groups = [np.arange(used.shape[0])] if places is None else places
+        beyond = max(int(group.max()) for group in groups)
+        if beyond >= used.shape[0]:
+            raise ValueError(
+                f"groups has the place {beyond}; the observation has {used.shape[0]} values"
+            )
         squares = jnp.stack([nis_of(plain[1], group) for group in groups])
         count = jnp.stack([jnp.sum(used[group]) for group in groups])
         heard = count > 0
@@ -159,8 +165,11 @@ def _places(
         groups = [name for name, _ in model.channels] if model is not None else []
         if not groups:
             return None
-    if not groups or not all(len(group) for group in groups):
+    if isinstance(groups, str) or not isinstance(groups, Sequence):
+        raise ValueError(f"groups is {described(groups)}; it must be a list of names or of places")
+    if not groups or not all(isinstance(group, Sequence) and len(group) for group in groups):
         raise ValueError(f"groups is {list(groups)}; a gate needs groups of one channel or more")
+    width = sum(size for _, size in model.channels) if model is not None else 0
     places = []
     for group in groups:
         if isinstance(group, str):
@@ -168,6 +177,10 @@ def _places(
                 raise ValueError(f"the filter has no model whose channel {group!r} could be meant")
             at = model.channel(group)
             group = range(at.start, at.stop)
+        for place in group:
+            if not isinstance(place, int | np.integer) or place < 0 or (width and place >= width):
+                accepted = f"from 0 to {width - 1}" if width else "zero or above"
+                raise ValueError(f"groups has the place {place!r}; it must be whole, {accepted}")
         places.append(np.array(list(group)))
     every = np.concatenate(places)
     if len(set(every.tolist())) != len(every):

@@ -247,7 +247,7 @@ def _iterated(
             length = rule.step
             if trials and not printed:
                 length = _search_length(model, problem, obs, slope, point, moved, rule, trials)
-            step = jnp.where(solved.root.positive_definite, length, 0) * moved
+            step = jnp.where(solved.root.positive_definite, length * moved, 0)
             return point + step, solved._replace(moved=jnp.any(step != 0))
 
         point, steps = jax.lax.scan(
@@ -257,9 +257,11 @@ def _iterated(
         left = jnp.eye(problem.states, dtype=L.dtype) - last.gain @ last.slope.A
         noise = last.slope.R + last.slope.spread_noise
         whitened = left @ left.T + last.gain @ noise @ last.gain.T
+        solvable = jnp.all(steps.root.positive_definite)
+        point = jnp.where(solvable, point, 0)
+        whitened = jnp.where(solvable, whitened, jnp.eye(problem.states, dtype=L.dtype))
         x = model.retract(prior.mean, L @ point[: problem.states])
         mended = state.indefinite | ~whitening.semidefinite
-        solvable = jnp.all(steps.root.positive_definite)
         judged = first.root._replace(positive_definite=solvable)
         info = innovation_info(first.slope.innovation, first.S, judged, told, mended)
         taken = jnp.sum(steps.moved).astype(jnp.int32)

@@ -134,19 +134,23 @@ def ekf(model: Model) -> Filter:
         told = heard(model.observation_noise(params.model, state.x, u), obs)
         obs, R = told.obs, told.noise
         nu = masked_innovation(model, obs, z_pred)
-        HP = push(state.P)
+        # A derivative that is not a number where a channel is missing must not reach a product.
+        HP = jnp.where(obs.valid[:, None], push(state.P), 0)
         S = jnp.where(obs.valid[:, None] & obs.valid[None], push(HP.T), 0) + R
-        solution = solved(S, cholesky(S), nu)
+        root = cholesky(S)
+        sound = jnp.where(root.positive_definite, S, jnp.eye(S.shape[0], dtype=S.dtype))
+        solution = solved(sound, root, nu)
         root = solution.root
         # S does not couple valid channels with invalid ones: a zero here is a zero in the gain.
-        B = jnp.where(obs.valid[:, None] & root.positive_definite, HP, 0)
-        gain = checkpoint_name(solve_positive(root.factor, S, B), KEPT)
-        HA = push(state.P - matmul(HP.T, gain))
+        usable = obs.valid[:, None] & root.positive_definite
+        B = jnp.where(usable, HP, 0)
+        gain = checkpoint_name(solve_positive(root.factor, sound, B), KEPT)
+        HA = jnp.where(usable, push(state.P - matmul(B.T, gain)), 0)
         # What the Joseph form adds is zero but for rounding, whatever the parameters are, and so is
         # its derivative.
         joseph = matmul((matmul(R, gain) - HA).T, gain)
-        P = state.P - explained(S, B, gain) + jax.lax.stop_gradient(joseph)
-        x = model.retract(state.x, corrected(S, B, nu, gain, solution.weighed))
+        P = state.P - explained(sound, B, gain) + jax.lax.stop_gradient(joseph)
+        x = model.retract(state.x, corrected(sound, B, nu, gain, solution.weighed))
         info = innovation_info(nu, S, root, told, state.indefinite, solution=solution)
         return KalmanState(x, P, jnp.zeros_like(state.indefinite)), info
 

@@ -141,8 +141,8 @@ def _reweighted(
     The info is that of the plain update, so that its likelihood and NIS tell of the data as the
     model has them; flags of the reweighted updates are added.
     """
-    if iterations < 1:
-        raise ValueError(f"iterations is {iterations}; a robust update needs at least 1")
+    if not isinstance(iterations, int) or iterations < 1:
+        raise ValueError(f"iterations is {iterations}; a robust update needs 1 or more, and whole")
     model = inside.model
     require_additive(model, "a robust filter")
     base = inside.on(with_given_noise(model))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import POSITIVE
+from jaxnav.estimation.checks import POSITIVE, require_ordered
 from jaxnav.estimation.filters.adaptive import softly_clamped
 from jaxnav.estimation.filters.innovation import heard_by, mask_noise, masked_innovation
 from jaxnav.estimation.filters.wrapping import (
@@ -141,6 +141,8 @@ def sage_husa(
 
     def check(params: FilterParams) -> None:
         base.check(require_wrapper(params, SageHusa(), _DOMAINS))
+        own, _ = parted(params, SageHusa())
+        require_ordered(own.low, own.high, "SageHusa")
 
     def init(params: FilterParams) -> SageHusaState:
         dtype = params.initial.cov.dtype

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.carried import carried_or
 from jaxnav.estimation.models import Channel
 from jaxnav.estimation.types import Input, Point
 from jaxnav.navigation.atmosphere import temperature
@@ -51,7 +52,7 @@ def barometer(height: Callable[[Point], Array] = lambda x: x.position[2]) -> Cha
     def observe(params: Barometer, x: Point, u: Input) -> Array:
         del u
         above = params.stretch * (height(x) - params.reference)
-        return jnp.reshape(params.reference + above, (1,)) + getattr(x, BIAS, 0.0)
+        return jnp.reshape(params.reference + above, (1,)) + carried_or(x, BIAS, 1, 0.0)
 
     return Channel(1, observe, lambda params, x, u: jnp.reshape(params.sigma**2, (1,)))
 

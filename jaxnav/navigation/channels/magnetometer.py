@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.estimation.carried import carried_or
 from jaxnav.estimation.models import Channel
 from jaxnav.estimation.types import Input, Point
 from jaxnav.numerics.linalg import matmul
@@ -46,7 +47,7 @@ def magnetometer() -> Channel:
 
     def observe(params: Magnetometer, x: Point, u: Input) -> Array:
         del u
-        return matmul(x.dcm.T, params.field) + getattr(x, HARD_IRON, 0.0)
+        return matmul(x.dcm.T, params.field) + carried_or(x, HARD_IRON, 3, 0.0)
 
     return Channel(3, observe, lambda params, x, u: jnp.broadcast_to(params.sigma**2, (3,)))
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.carried import carried_or
 from jaxnav.estimation.models import Channel
 from jaxnav.estimation.types import Input, Point
 from jaxnav.navigation.earth import displaced, ecef_from_geodetic
@@ -47,8 +48,11 @@ def ranges(count: int) -> Channel:
 
     def observe(params: Beacons, x: Point, u: Input) -> Array:
         del u
+        shape = jnp.shape(params.position)
+        if shape != (count, 3):
+            raise ValueError(f"the beacons' positions are {shape}; they must be ({count}, 3)")
         antenna = displaced(x.position, matmul(x.dcm, params.lever_arm))
         ray = jax.vmap(ecef_from_geodetic)(params.position) - ecef_from_geodetic(antenna)[None]
-        return jax.vmap(safe_norm)(ray) + getattr(x, OFFSET, 0.0)
+        return jax.vmap(safe_norm)(ray) + carried_or(x, OFFSET, 1, 0.0)
 
     return Channel(count, observe, lambda params, x, u: jnp.asarray(params.sigma) ** 2)

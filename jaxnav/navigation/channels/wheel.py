@@ -11,8 +11,10 @@ References:
 
 from collections.abc import Callable
 
+import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.carried import carried_or
 from jaxnav.estimation.models import Channel
 from jaxnav.estimation.types import Input, Params, Point
 from jaxnav.navigation.channels.steered import Axle, axle_velocity
@@ -39,6 +41,6 @@ def wheel_speed(
 
     def observe(params: Params, x: Point, u: Input) -> Array:
         forward = axle_velocity(axle(params, x, u), x, earth)[:1]
-        return forward * (1.0 + getattr(x, SCALE, 0.0))
+        return forward * (1.0 + carried_or(x, SCALE, 1, 0.0))
 
-    return Channel(1, observe, lambda params, x, u: (sigma(params) ** 2).reshape(1))
+    return Channel(1, observe, lambda params, x, u: jnp.reshape(sigma(params) ** 2, (1,)))
