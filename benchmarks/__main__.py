@@ -18,6 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}")
     parser.add_argument("--quick", action="store_true", help="smaller problems, in seconds")
     parser.add_argument("--json", type=Path, metavar="DIR", help="write NAME.json in this folder")
+    parser.add_argument("--before", metavar="JAXNAV", help="commands: beside another version")
     args = parser.parse_args(argv)
     unknown = [name for name in args.names if name not in NAMES]
     if unknown:
@@ -29,6 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = [sys.executable, str(Path(__file__).with_name(f"{name}.py"))]
         command += ["--quick"] if args.quick else []
         command += ["--json", str(args.json / f"{name}.json")] if args.json is not None else []
+        if args.before is not None and name == "commands":
+            command += ["--before", args.before]
         failed = subprocess.run(command).returncode or failed
     return failed
 

@@ -78,7 +78,9 @@ def now() -> Moment:
         everyone = (int(user) + int(nice) + int(system)) / os.sysconf("SC_CLK_TCK")
     except (OSError, ValueError):
         everyone = None
-    return Moment(time.perf_counter(), everyone, time.process_time())
+    below = resource.getrusage(resource.RUSAGE_CHILDREN)
+    own = time.process_time() + below.ru_utime + below.ru_stime
+    return Moment(time.perf_counter(), everyone, own)
 
 
 def cores_elsewhere(start: Moment) -> list[str]:
