@@ -116,23 +116,35 @@ def _reference_errors(errors: ReferenceErrors, path: Path) -> Path:
 
 
 def _nis(report: Report, path: Path) -> Path:
-    drive, kept = report.drive, report.kept
-    at = drive.fix_step
-    freedom = sum(seen.valid[at].sum(axis=1) for seen in drive.channels.values())
-    nis = np.asarray(kept.nis)[at] / np.maximum(freedom, 1)
-    usual = int(np.median(freedom))
-    bounds = chi2.ppf([0.025, 0.975], usual) / usual
-    with figure(path, (8, 3)) as drawing:
-        axes = drawing.subplots()
-        label = f"95 % of chi-square of {usual}"
-        axes.axhspan(*bounds, color="0.85", lw=0, label=label)
-        axes.plot(drive.time[at], nis, ".", ms=2, color=COLOURS["filter"], label="at a fix")
-        axes.set_yscale("log")
-        axes.set_ylim(*_decades(nis))
-        axes.margins(x=0)
-        axes.set_xlabel("time [s]")
-        axes.set_ylabel("NIS per channel")
-        axes.legend(ncols=2, loc="upper right")
+    """Draw the NIS of each channel that was used, with what was refused at the top."""
+    time = report.drive.time
+    every = report.kept.parts
+    parts = {name: every[name] for name in report.drive.channels if np.any(every[name].used)}
+    with figure(path, (8, 1 + 1.7 * len(parts))) as drawing:
+        panels = drawing.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (name, part) in zip(panels, parts.items(), strict=True):
+            count = np.asarray(part.used).sum(axis=1)
+            at = count > 0
+            nis = np.asarray(part.nis)[at] / count[at]
+            usual = int(np.median(count[at]))
+            bounds = chi2.ppf([0.025, 0.975], usual) / usual
+            label = f"95 % of chi-square of {usual}"
+            axes.axhspan(*bounds, color="0.85", lw=0, label=label)
+            axes.plot(time[at], nis, ".", ms=2, color=COLOURS["filter"], label="an update")
+            refused = np.asarray(part.refused).any(axis=1)
+            if refused.any():
+                top = axes.get_xaxis_transform()
+                marks = np.full(refused.sum(), 0.97)
+                axes.plot(
+                    time[refused], marks, "|", color="tab:red", transform=top, label="refused"
+                )
+            axes.set_yscale("log")
+            low, high = _decades(nis)
+            axes.set_ylim(min(low, bounds[0] / 2), max(high, 4 * bounds[1]))
+            axes.margins(x=0)
+            axes.set_ylabel(f"{name}\nNIS per value")
+            axes.legend(ncols=3, loc="upper right")
+        panels[-1].set_xlabel("time [s]")
     return path
 
 
