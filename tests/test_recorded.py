@@ -297,7 +297,8 @@ def test_figures_are_drawn(report: Report, tmp_path: Path) -> None:
     [
         ("filtre = 'ekf'", "there is no 'filtre'; it must be one of filter, r_factors"),
         ("config = 'x'", "there is no 'config'"),
-        ("filter = 'kf'", "filter is 'kf'; it must be one of ekf, ukf, liekf"),
+        ("filter = 3", "filter is 3; it must be a text"),
+        ("carry = 'mounting'", "carry is 'mounting'; it must be a list of texts"),
         ("r_factors = 2.0", "r_factors is 2.0; it must be a list of numbers"),
         ("axle_m = [1.0, 2.0]", r"axle_m is \[1.0, 2.0\]; it must be a list of 3 numbers"),
         ("seed = 1.5", "seed is 1.5; it must be a whole number"),

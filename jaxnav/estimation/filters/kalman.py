@@ -137,20 +137,19 @@ def ekf(model: Model) -> Filter:
         # A derivative that is not a number where a channel is missing must not reach a product.
         HP = jnp.where(obs.valid[:, None], push(state.P), 0)
         S = jnp.where(obs.valid[:, None] & obs.valid[None], push(HP.T), 0) + R
-        root = cholesky(S)
-        sound = jnp.where(root.positive_definite, S, jnp.eye(S.shape[0], dtype=S.dtype))
-        solution = solved(sound, root, nu)
+        solution = solved(S, cholesky(S), nu)
         root = solution.root
         # S does not couple valid channels with invalid ones: a zero here is a zero in the gain.
         usable = obs.valid[:, None] & root.positive_definite
         B = jnp.where(usable, HP, 0)
-        gain = checkpoint_name(solve_positive(root.factor, sound, B), KEPT)
+        gain = jnp.where(root.positive_definite, solve_positive(root.factor, S, B), 0)
+        gain = checkpoint_name(gain, KEPT)
         HA = jnp.where(usable, push(state.P - matmul(B.T, gain)), 0)
         # What the Joseph form adds is zero but for rounding, whatever the parameters are, and so is
         # its derivative.
         joseph = matmul((matmul(R, gain) - HA).T, gain)
-        P = state.P - explained(sound, B, gain) + jax.lax.stop_gradient(joseph)
-        x = model.retract(state.x, corrected(sound, B, nu, gain, solution.weighed))
+        P = state.P - explained(S, B, gain) + jax.lax.stop_gradient(joseph)
+        x = model.retract(state.x, corrected(S, B, nu, gain, solution.weighed))
         info = innovation_info(nu, S, root, told, state.indefinite, solution=solution)
         return KalmanState(x, P, jnp.zeros_like(state.indefinite)), info
 
