@@ -82,7 +82,9 @@ if TYPE_CHECKING:
         linearised_at_truth as linearised_at_truth,
     )
     from jaxnav.estimation.bounds import oracle as oracle
+    from jaxnav.estimation.carried import CarriedParams as CarriedParams
     from jaxnav.estimation.carried import carrying as carrying
+    from jaxnav.estimation.carried import with_carried as with_carried
     from jaxnav.estimation.filters.adaptive import (
         innovation_adaptive as innovation_adaptive,
     )
@@ -173,7 +175,7 @@ _HOMES = {
     ),
     "jaxnav.estimation.banks.reset": ("WindowedReset", "windowed_reset"),
     "jaxnav.estimation.bounds": ("linearised_at_truth", "oracle"),
-    "jaxnav.estimation.carried": ("carrying",),
+    "jaxnav.estimation.carried": ("CarriedParams", "carrying", "with_carried"),
     "jaxnav.estimation.filters.adaptive": ("innovation_adaptive",),
     "jaxnav.estimation.filters.gated": ("Gate", "Gated", "gated"),
     "jaxnav.estimation.filters.iterated": (

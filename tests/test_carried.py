@@ -22,7 +22,7 @@ from jaxnav.estimation.carried import (
     with_carried,
 )
 from jaxnav.estimation.filters.kalman import ekf
-from jaxnav.estimation.models import Channel, ModelParams, Process, observing, shared
+from jaxnav.estimation.models import Channel, ModelParams, Process, measured, observing, shared
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs
 from jaxnav.navigation.models import sins_gnss, vehicle
@@ -318,6 +318,17 @@ def test_the_order_of_names_does_not_matter() -> None:
     one, other = (with_carried(START, dict(order)) for order in orders)
     np.testing.assert_array_equal(one.cov, other.cov)
     np.testing.assert_array_equal(np.diag(one.cov), [1, 1, 1, 1, 2])
+
+
+def test_the_precision_is_that_of_the_arrays() -> None:
+    narrow = jnp.float32
+    start = Gaussian(jnp.zeros(2, narrow), jnp.eye(2, dtype=narrow))
+    wide = with_carried(start, {"bias": (jnp.zeros(1, narrow), jnp.ones(1, narrow))})
+    assert {leaf.dtype for leaf in jax.tree.leaves(wide)} == {jnp.dtype(narrow)}
+    x, noise = jnp.zeros((3, 2), narrow), jnp.ones(1, narrow)
+    seen = Channel(1, lambda p, x, u: x[:1], lambda p, x, u: p)
+    assert measured(jax.random.key(0), seen, noise, x, None).dtype == narrow
+    assert measured(jax.random.key(0), seen, jnp.array([1]), jnp.zeros((3, 2)), None).dtype == float
 
 
 def test_channels_are_added_to_a_model_whose_own_go_on() -> None:

@@ -176,13 +176,21 @@ def test_a_bank_of_wrapped_filters_has_parameters_of_each_member() -> None:
     run_bank = compiled(ran, static_argnums=0)
     several: Any = run_bank(mmae(filter), members, z)
     np.testing.assert_allclose(several[0].mean, single.mean, rtol=1e-10, atol=1e-12)
-    noise, inner = own.own
-    apart = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), own)
-    forgetting = noise._replace(forgetting=jnp.array([0.5, 0.99]))
-    rest = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (noise, inner))
-    apart = apart._replace(own=(rest[0]._replace(forgetting=forgetting.forgetting), rest[1]))
+    noise, inner = replicate(own, 2).own
+    noise = noise._replace(forgetting=jnp.array([0.5, 0.99]))
+    apart = replicate(own, 2)._replace(own=(noise, inner))
     weighed: Any = run_bank(mmae(filter), BankParams(apart, ()), z)
     assert np.abs(weighed[0].mean - single.mean).max() > 1e-4
+
+
+def test_what_a_gate_inside_refuses_stays_told() -> None:
+    """An outer gate over one channel does not hide what an inner one left out of another."""
+    filter = gated(versoria(gated(ekf(MODEL), ["both"])), ["first"])
+    gate = Gate(1e-6, 3.0)
+    _, info = ran(filter, params(gate, (Versoria(0.0), (gate, ()))), jnp.asarray(data()[0]))
+    assert info.refused[OUTLIER].tolist() == [False, True, True]
+    assert info.flags[OUTLIER] & Flag.REFUSED
+    assert not info.used[OUTLIER, 1:].any()
 
 
 def test_parameters_of_wrappers_may_be_left_out() -> None:

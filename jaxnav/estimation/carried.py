@@ -11,6 +11,7 @@ those of the carried states in the order of their names.
 import keyword
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -143,25 +144,10 @@ def carrying(
     total = sum(law.size for law in states.values())
     step = period if callable(period) else lambda u: jnp.asarray(period)
     corrected = inputs or (lambda carried, u: u)
+    split, flat = partial(_split, states), partial(_flat, states)
 
     def laws(params: CarriedParams, u: Input, what: str) -> Array:
-        """Return a property of all laws, laid out as in the tangent space."""
-        dt = jnp.maximum(step(u), 0)
-        found = [
-            jnp.broadcast_to(getattr(law, what)(params.carried[name], dt), (law.size,))
-            for name, law in states.items()
-        ]
-        return jnp.concatenate(found)
-
-    def split(flat: Array) -> dict[str, Array]:
-        parts, first = {}, 0
-        for name, law in states.items():
-            parts[name] = flat[first : first + law.size]
-            first += law.size
-        return parts
-
-    def flat(carried: Mapping[str, Array]) -> Array:
-        return jnp.concatenate([carried[name] for name in states])
+        return _of_laws(states, params, jnp.maximum(step(u), 0), what)
 
     def moved_own(params: CarriedParams, x: Carried, u: Input) -> Point:
         _check_params(params, states)
@@ -212,6 +198,29 @@ def carrying(
     )
 
 
+def _split(states: Mapping[str, Law], flat: Array) -> dict[str, Array]:
+    """Return by name what is laid out as in the tangent space."""
+    parts, first = {}, 0
+    for name, law in states.items():
+        parts[name] = flat[first : first + law.size]
+        first += law.size
+    return parts
+
+
+def _flat(states: Mapping[str, Law], carried: Mapping[str, Array]) -> Array:
+    """Return carried states laid out as in the tangent space."""
+    return jnp.concatenate([carried[name] for name in states])
+
+
+def _of_laws(states: Mapping[str, Law], params: CarriedParams, dt: Array, what: str) -> Array:
+    """Return a property of all laws over ``dt`` seconds, laid out as in the tangent space."""
+    found = [
+        jnp.broadcast_to(getattr(law, what)(params.carried[name], dt), (law.size,))
+        for name, law in states.items()
+    ]
+    return jnp.concatenate(found)
+
+
 def with_carried(initial: Gaussian, states: Mapping[str, tuple[Array, Array]]) -> Gaussian:
     """Return what is known at the start with that of carried states, which are independent of it.
 
@@ -225,7 +234,7 @@ def with_carried(initial: Gaussian, states: Mapping[str, tuple[Array, Array]]) -
     """
     states = {name: _known_before(name, *entry) for name, entry in sorted(states.items())}
     wide = [cov if jnp.ndim(cov) == 2 else jnp.diag(cov) for _, cov in states.values()]
-    mean = Carried(initial.mean, {name: jnp.asarray(value) for name, (value, _) in states.items()})
+    mean = Carried(initial.mean, {name: value for name, (value, _) in states.items()})
     return Gaussian(mean, jax.scipy.linalg.block_diag(initial.cov, *wide))
 
 
@@ -266,7 +275,7 @@ def carried_or(x: Any, name: str, size: int, default: Any) -> Any:
 
 
 def _known_before(name: str, mean: Any, variance: Any) -> tuple[Array, Array]:
-    mean, variance = jnp.asarray(mean, float), jnp.asarray(variance, float)
+    mean, variance = _floating(mean), _floating(variance)
     k = mean.shape[0] if mean.ndim == 1 else 0
     if k == 0:
         raise ValueError(f"the mean of {name!r} is {mean.shape}; it must be (k,)")
@@ -275,6 +284,12 @@ def _known_before(name: str, mean: Any, variance: Any) -> tuple[Array, Array]:
             f"the variance of {name!r} is {variance.shape}; it must be ({k},) or ({k}, {k})"
         )
     return mean, variance
+
+
+def _floating(value: Any) -> Array:
+    """Return an array in the precision that it has, whole numbers in the usual one."""
+    array = jnp.asarray(value)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
 def _fields_of(x: Any) -> set[str]:

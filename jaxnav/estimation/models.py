@@ -246,7 +246,9 @@ def measured(key: Array, channel: Channel, params: Params, states: Point, inputs
         noisy = channel.noisy or NonAdditive(
             lambda params, x, v, u: channel.observe(params, x, u) + v, channel.noise
         )
-        noise = jnp.asarray(noisy.noise(params, x, u), jnp.result_type(float))
+        noise = jnp.asarray(noisy.noise(params, x, u))
+        if not jnp.issubdtype(noise.dtype, jnp.floating):
+            noise = noise.astype(float)
         white = jax.random.normal(key, noise.shape[:1], noise.dtype)
         root = semidefinite_root(jnp.diag(noise) if noise.ndim == 1 else noise)
         v = jnp.where(root.semidefinite, root.factor, jnp.nan) @ white

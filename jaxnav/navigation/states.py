@@ -53,6 +53,8 @@ class AttitudeLayout(NamedTuple):
 
 
 LAYOUT = Layout()
+STATES = LAYOUT.nabla.stop
+"""Number of the error state's coordinates."""
 ATTITUDE_LAYOUT = AttitudeLayout()
 
 

@@ -235,10 +235,11 @@ def _channel_scores(drive: Drive, kept: Kept) -> dict[str, Any]:
         used, refused = np.asarray(part.used), np.asarray(part.refused)
         count = int(used.sum())
         nis = float(np.asarray(part.nis)[used.any(axis=1)].sum()) / count if count else None
-        arrived = drive.channels[name].valid.any(axis=1) if name in drive.channels else used[:, 0]
+        # What the drive has nothing of was never used either.
+        arrived = drive.channels[name].valid if name in drive.channels else used
         found[name] = {
             "updates": int(used.any(axis=1).sum()),
-            "arrived": int(arrived.sum()),
+            "arrived": int(arrived.any(axis=1).sum()),
             "refused": int(refused.any(axis=1).sum()),
             "nis_per_value": nis,
         }

@@ -40,7 +40,8 @@ class FilterConfig:
         config: TOML file with these names; flags go before it.
         filter: The filter, or the members of the bank: any of `jaxnav list`, in wrappers as
             sage_husa(versoria(ekf)), or one of the short names liekf (left-invariant errors),
-            se23-ekf (right-invariant ones), versoria-ekf, sage-husa-ekf and iae.
+            se23-ekf (right-invariant ones), versoria-ekf, sage-husa-ekf and iae. With --from FILE
+            also those of a Python file of your own.
         r_factors: Factors on the variances of the receiver, a member each.
         q_factors: Factors on the process noise, a member each.
         forgetting: Forgetting factors of sage_husa, a member each.

@@ -38,7 +38,7 @@ from jaxnav.estimation.types import (
 )
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams
 from jaxnav.navigation.models.vehicle import FIXES, VehicleParams, vehicle
-from jaxnav.navigation.states import ErrorForm, LevelError, SinsLevel, error_form
+from jaxnav.navigation.states import STATES, ErrorForm, LevelError, SinsLevel, error_form
 from jaxnav.recorded.carry import carried, laws
 from jaxnav.recorded.config import FilterConfig, members, parts_of
 from jaxnav.recorded.preparation import Drive
@@ -46,8 +46,6 @@ from jaxnav.studies.base import ConfigError
 from jaxnav.units import DEG, GRAVITY
 
 ERRORS: dict[str, LevelError] = {"liekf": "left-invariant", "se23-ekf": "right-invariant"}
-STATES = 15
-"""Tangent coordinates of the model's own state; what is carried comes after."""
 NOISE_RANGE = (0.1, 1e6)
 """Variance over the nominal that a Sage-Husa filter may estimate: RTK to hundreds of metres."""
 

@@ -132,7 +132,7 @@ def test_groups_are_apart_and_parameters_are_its_own() -> None:
     obs = jn.Obs(jnp.asarray(Z), jnp.ones(Z.shape, bool))
     with pytest.raises(ValueError, match=r"^params is a BankParams; a gated bank takes Gated"):
         jn.run(GATES["bank"], BANK, jnp.zeros((STEPS, 1)), obs)
-    with pytest.raises(ValueError, match=r"^params is a Gated; a single filter takes FilterParams"):
+    with pytest.raises(ValueError, match=r"^params is Gated, of a bank; a gated filter takes"):
         jn.run(GATES["kf"], Gated(PRIOR), jnp.zeros((STEPS, 1)), obs)
     for groups in ((), ((0,), ())):
         with pytest.raises(ValueError, match="needs groups of one channel or more"):

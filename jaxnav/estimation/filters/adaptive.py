@@ -136,18 +136,11 @@ def innovation_adaptive(
     def restart(state: AdaptiveState, estimate: Gaussian) -> AdaptiveState:
         return state._replace(inner=base.restart(state.inner, estimate))
 
-    return Filter(
-        init,
-        predict,
-        update,
-        estimate,
-        restart,
-        own_model.retract,
-        own_model.local,
-        check,
-        own_model,
-        on=lambda other: innovation_adaptive(inside.on(other), smooth=smooth),
-    )
+    def on(other: Model) -> Filter:
+        return innovation_adaptive(inside.on(other), smooth=smooth)
+
+    retract, local = own_model.retract, own_model.local
+    return Filter(init, predict, update, estimate, restart, retract, local, check, own_model, on)
 
 
 def moved_log_factor(

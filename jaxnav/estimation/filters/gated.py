@@ -11,7 +11,17 @@ from jax import Array
 from jaxnav.estimation.checks import described, require_fields, require_filter
 from jaxnav.estimation.filters.innovation import nis_of
 from jaxnav.estimation.filters.wrapping import parted, require_wrapper
-from jaxnav.estimation.types import Filter, Flag, Gaussian, Info, Input, Model, Obs, Params
+from jaxnav.estimation.types import (
+    Filter,
+    Flag,
+    Gaussian,
+    Info,
+    Input,
+    Model,
+    Obs,
+    Params,
+    flags_of,
+)
 
 
 class Gate(NamedTuple):
@@ -79,6 +89,11 @@ def gated(filter: Filter, groups: Sequence[str | Sequence[int]] | None = None) -
     single = filter.on is not None
 
     def check(params: Any) -> None:
+        if single and isinstance(params, Gated):
+            raise ValueError(
+                "params is Gated, of a bank; a gated filter takes FilterParams(model, initial, "
+                "own=(Gate(...), the filter's own))"
+            )
         if single:
             return filter.check(require_wrapper(params, Gate(), _DOMAINS))
         if not isinstance(params, Gated):
@@ -99,41 +114,23 @@ def gated(filter: Filter, groups: Sequence[str | Sequence[int]] | None = None) -
     def update(params: Params, state: GatedState, u: Input, obs: Obs) -> tuple[GatedState, Info]:
         gate, own = split(params)
         plain = filter.update(own, state.inner, u, obs)
-        used = plain[1].used
-        groups = [np.arange(used.shape[0])] if places is None else places
-        beyond = max(int(group.max()) for group in groups)
-        if beyond >= used.shape[0]:
-            raise ValueError(
-                f"groups has the place {beyond}; the observation has {used.shape[0]} values"
-            )
-        squares = jnp.stack([nis_of(plain[1], group) for group in groups])
-        count = jnp.stack([jnp.sum(used[group]) for group in groups])
-        heard = count > 0
-        dtype = squares.dtype
-        opened = jnp.exp(-state.refused.astype(dtype) / gate.patience)
-        improbable = _tail(squares, count) < gate.false_alarm
-        refuse = heard & (_tail(squares * opened, count) < gate.false_alarm)
-        reopened = heard & improbable & ~refuse
-        channels = jnp.zeros(obs.valid.shape, bool)
-        for i, group in enumerate(groups):
-            channels = channels.at[group].set(refuse[i])
-        left = obs._replace(valid=obs.valid & ~channels)
-        excess = jnp.max(jnp.where(reopened, 1 / opened, 1))
+        groups = [np.arange(obs.valid.shape[0])] if places is None else places
+        found = _judged(gate, state.refused, plain[1], groups)
+        left = obs._replace(valid=obs.valid & ~found.channels)
+        reopened = jnp.any(found.reopened)
 
         def again(_: Any) -> tuple[Any, Info]:
             known = filter.estimate(state.inner)
-            wider = filter.restart(state.inner, Gaussian(known.mean, excess * known.cov))
-            chosen = jax.tree.map(
-                lambda a, b: jnp.where(jnp.any(reopened), a, b), wider, state.inner
-            )
+            wider = filter.restart(state.inner, Gaussian(known.mean, found.excess * known.cov))
+            chosen = jax.tree.map(lambda a, b: jnp.where(reopened, a, b), wider, state.inner)
             return filter.update(own, chosen, u, left)
 
-        inner, info = jax.lax.cond(jnp.any(refuse | reopened), again, lambda _: plain, None)
-        raised = jnp.where(jnp.any(refuse), int(Flag.REFUSED), 0)
-        raised = raised | jnp.where(jnp.any(reopened), int(Flag.REOPENED), 0)
-        refused = jnp.where(refuse, state.refused + 1, jnp.where(heard, 0, state.refused))
-        flags = info.flags | raised.astype(jnp.int32)
-        return GatedState(inner, refused), info._replace(flags=flags, refused=channels)
+        refused = jnp.any(found.refuse)
+        inner, info = jax.lax.cond(refused | reopened, again, lambda _: plain, None)
+        raised = flags_of({Flag.REFUSED: refused, Flag.REOPENED: reopened})
+        # What a gate inside has refused stays so.
+        info = info._replace(flags=info.flags | raised, refused=info.refused | found.channels)
+        return GatedState(inner, found.in_a_row), info
 
     def estimate(state: GatedState) -> Any:
         return filter.estimate(state.inner)
@@ -141,20 +138,46 @@ def gated(filter: Filter, groups: Sequence[str | Sequence[int]] | None = None) -
     def restart(state: GatedState, given: Gaussian) -> GatedState:
         return state._replace(inner=filter.restart(state.inner, given))
 
-    build = filter.on
+    build, retract, local = filter.on, filter.retract, filter.local
     on = build and (lambda model: gated(build(model), groups))
-    return Filter(
-        init,
-        predict,
-        update,
-        estimate,
-        restart,
-        filter.retract,
-        filter.local,
-        check,
-        filter.model,
-        on,
-    )
+    return Filter(init, predict, update, estimate, restart, retract, local, check, filter.model, on)
+
+
+class _Judged(NamedTuple):
+    """What a gate makes of an update: by group, and of the ``channels`` ``(m,)``.
+
+    Attributes:
+        refuse: ``(G,)`` groups that are left out.
+        reopened: ``(G,)`` groups that pass though they contradict the filter.
+        in_a_row: ``(G,)`` refusals since the last group that passed.
+        channels: ``(m,)`` channels that are left out.
+        excess: By how much the gate has opened, in squares; one where it has not.
+    """
+
+    refuse: Array
+    reopened: Array
+    in_a_row: Array
+    channels: Array
+    excess: Array
+
+
+def _judged(gate: Gate, in_a_row: Array, info: Info, groups: list[np.ndarray]) -> _Judged:
+    """Hold the innovations of an update against the gate, which refusals have opened."""
+    beyond, width = max(int(group.max()) for group in groups), info.used.shape[0]
+    if beyond >= width:
+        raise ValueError(f"groups has the place {beyond}; the observation has {width} values")
+    squares = jnp.stack([nis_of(info, group) for group in groups])
+    count = jnp.stack([jnp.sum(info.used[group]) for group in groups])
+    heard = count > 0
+    opened = jnp.exp(-in_a_row.astype(squares.dtype) / gate.patience)
+    improbable = _tail(squares, count) < gate.false_alarm
+    refuse = heard & (_tail(squares * opened, count) < gate.false_alarm)
+    reopened = heard & improbable & ~refuse
+    channels = jnp.zeros(info.used.shape, bool)
+    for i, group in enumerate(groups):
+        channels = channels.at[group].set(refuse[i])
+    again = jnp.where(refuse, in_a_row + 1, jnp.where(heard, 0, in_a_row))
+    return _Judged(refuse, reopened, again, channels, jnp.max(jnp.where(reopened, 1 / opened, 1)))
 
 
 def _places(

@@ -159,6 +159,5 @@ def ekf(model: Model) -> Filter:
     def restart(state: KalmanState, given: Gaussian) -> KalmanState:
         return KalmanState(*given, state.indefinite)
 
-    return Filter(
-        init, predict, update, estimate, restart, model.retract, model.local, check, model, ekf
-    )
+    retract, local = model.retract, model.local
+    return Filter(init, predict, update, estimate, restart, retract, local, check, model, ekf)

@@ -201,10 +201,8 @@ def sage_husa(
             inside.on(other), channels=width, form=form, current=current, smooth=smooth
         )
 
-    local = own_model.local
-    return Filter(
-        init, predict, update, estimate, restart, own_model.retract, local, check, own_model, on
-    )
+    retract, local = own_model.retract, own_model.local
+    return Filter(init, predict, update, estimate, restart, retract, local, check, own_model, on)
 
 
 def averaging(forgetting: Array | float, count: Array) -> Array:

@@ -241,18 +241,11 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         # Points that were kept stay until the next prediction makes them anew.
         return SigmaPointState(given.mean, given.cov, state.points, state.indefinite)
 
-    return Filter(
-        init,
-        predict,
-        update,
-        estimate,
-        restart,
-        model.retract,
-        model.local,
-        check,
-        model,
-        on=lambda other: _sigma_point(other, rule_of, redraw),
-    )
+    def on(other: Model) -> Filter:
+        return _sigma_point(other, rule_of, redraw)
+
+    retract, local = model.retract, model.local
+    return Filter(init, predict, update, estimate, restart, retract, local, check, model, on)
 
 
 def _square_root(model: Model, rule_of: RuleOf) -> Filter:
@@ -309,18 +302,11 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         indefinite = state.indefinite | ~root.semidefinite
         return SquareRootSigmaPointState(given.mean, root.factor, indefinite)
 
-    return Filter(
-        init,
-        predict,
-        update,
-        estimate,
-        restart,
-        model.retract,
-        model.local,
-        check,
-        model,
-        on=lambda other: _square_root(other, rule_of),
-    )
+    def on(other: Model) -> Filter:
+        return _square_root(other, rule_of)
+
+    retract, local = model.retract, model.local
+    return Filter(init, predict, update, estimate, restart, retract, local, check, model, on)
 
 
 def _rule(params: FilterParams, rule_of: RuleOf, n: int) -> SigmaRule:

@@ -130,17 +130,9 @@ def square_root_ekf(model: Model) -> Filter:
         indefinite = state.indefinite | ~root.semidefinite
         return SquareRootState(given.mean, root.factor, indefinite)
 
+    retract, local = model.retract, model.local
     return Filter(
-        init,
-        predict,
-        update,
-        estimate,
-        restart,
-        model.retract,
-        model.local,
-        check,
-        model,
-        square_root_ekf,
+        init, predict, update, estimate, restart, retract, local, check, model, square_root_ekf
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxnav.estimation.metrics import chi2_mean_bounds, rmse
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
+from jaxnav.navigation.states import STATES
 from jaxnav.studies.arekf.analysis import ratio_map
 from jaxnav.studies.arekf.claims import assess, change, squared_norms
 from jaxnav.studies.arekf.config import DRIFTING, RECORD_S, SCENARIOS, ArekfConfig
@@ -20,7 +21,6 @@ from jaxnav.studies.timing import Latency
 from jaxnav.units import DEG
 
 UNITS = {"attitude": ("deg", DEG), "velocity": ("m/s", 1.0), "position": ("m", 1.0)}
-STATES = 15
 LOST_M = 100.0
 """A method diverged in a run whose position is wrong by more than this at the end [m]."""
 EPOCHS = 12

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxnav.estimation.metrics import chi2_mean_bounds, rmse
 from jaxnav.estimation.montecarlo import Campaign
+from jaxnav.navigation.states import STATES
 from jaxnav.studies.attitude import AXES, DIVERGED_SIGMAS
 from jaxnav.studies.base import StudyResult, check_simulated, plain, run_scenarios
 from jaxnav.studies.rkcns import cost
@@ -23,7 +24,6 @@ from jaxnav.studies.rkcns.simulation import Limb, build_world, stars_of
 from jaxnav.units import ARCSEC, DEG_PER_HOUR, MICRO_G
 
 UNITS = {"m": 1.0, "arcsec": ARCSEC, "deg/h": DEG_PER_HOUR, "ug": MICRO_G}
-STATES = 15
 SHOWN = (
     *((name, "m") for name in POSITION),
     *((name, "arcsec") for name in AXES),
