@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 import jaxnav as jn
 from jaxnav.estimation.carried import Carried, CarriedParams, constant, with_carried
-from jaxnav.estimation.models import measured
+from jaxnav.estimation.sampling import measured
 from jaxnav.navigation.channels.gnss import GnssErrors, observe_gnss
 from jaxnav.navigation.models.sins_gnss import SinsGnssParams, sins_gnss
 from jaxnav.navigation.sense import Clock, sense_level

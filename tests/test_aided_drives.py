@@ -12,8 +12,9 @@ from jaxnav.compiling import compiled
 from jaxnav.estimation.carried import Carried, CarriedParams, carrying, random_walk, with_carried
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.metrics import chi2_mean_bounds, nees
-from jaxnav.estimation.models import ModelParams, Process, measured, observing
+from jaxnav.estimation.models import ModelParams, Process, observing
 from jaxnav.estimation.run import run
+from jaxnav.estimation.sampling import measured
 from jaxnav.estimation.types import FilterParams, Gaussian
 from jaxnav.navigation.atmosphere import pressure_height
 from jaxnav.navigation.channels.barometer import Barometer, barometer

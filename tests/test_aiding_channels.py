@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from jaxnav.estimation.carried import Carried
-from jaxnav.estimation.models import Channel, measured
+from jaxnav.estimation.models import Channel
+from jaxnav.estimation.sampling import measured
 from jaxnav.navigation.atmosphere import density, pressure, pressure_height, temperature
 from jaxnav.navigation.channels.barometer import Barometer, barometer, stretch
 from jaxnav.navigation.channels.baseline import Baseline, baseline

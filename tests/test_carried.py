@@ -22,8 +22,9 @@ from jaxnav.estimation.carried import (
     with_carried,
 )
 from jaxnav.estimation.filters.kalman import ekf
-from jaxnav.estimation.models import Channel, ModelParams, Process, measured, observing, shared
+from jaxnav.estimation.models import Channel, ModelParams, Process, observing, shared
 from jaxnav.estimation.run import run
+from jaxnav.estimation.sampling import measured
 from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs
 from jaxnav.navigation.models import sins_gnss, vehicle
 from jaxnav.navigation.models.sins_gnss import SinsGnssInput

@@ -571,6 +571,30 @@ def test_any_number_of_noises(sources: int) -> None:
         np.testing.assert_allclose(found.cov[i], cov, rtol=0, atol=1e-12)
 
 
+@each_maker
+def test_noise_is_in_the_units_of_the_residual(name: str) -> None:
+    """Values in degrees with a residual in metres, as latitudes are: the Kalman filter in metres."""
+    rng = np.random.default_rng(5)
+    H, R, P = rng.normal(size=(2, 2)), np.diag([4.0, 9.0]), np.array([[30.0, 8.0], [8.0, 20.0]])
+    to_metres = 111e3
+    model = still(
+        lambda x: jnp.array(H) @ x / to_metres,
+        R,
+        residual=lambda z, predicted: to_metres * (z - predicted),
+    )
+    z = rng.normal(size=(3, 2)) * 5
+    prior = Gaussian(jnp.zeros((3, 2)), jnp.array(np.tile(P, (3, 1, 1))))
+    valid = np.array([[True, True], [False, True], [True, False]])
+    obs = Obs(jnp.array(z / to_metres), jnp.array(valid))
+    found, info = updated(MAKERS[name](model, iterations=4), batch(prior), obs)
+    linear = Linear(np.eye(2)[None], np.zeros((1, 2, 2)), H, R, np.zeros(2), P)
+    for i in range(3):
+        mean, cov, _ = kalman_step(linear, 0, np.zeros(2), P, z[i], valid[i])
+        np.testing.assert_allclose(found.mean[i], mean, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(found.cov[i], cov, rtol=0, atol=1e-8)
+    assert np.all(np.asarray(info.flags) == 0)
+
+
 # The search
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from jaxnav.estimation.filters.kalman import ekf
-from jaxnav.estimation.models import Channel, ModelParams, Process, measured, observing, shared
-from jaxnav.estimation.run import run
+from jaxnav.estimation.models import Channel, ModelParams, Process, observing, shared
+from jaxnav.estimation.run import run, simulate
+from jaxnav.estimation.sampling import measured
 from jaxnav.estimation.types import FilterParams, Gaussian, Model, Obs
 
 F = jnp.array([[1.0, 0.1], [0.0, 1.0]])
@@ -59,6 +60,27 @@ def test_a_model_of_channels_is_the_one_stacked_by_hand() -> None:
     np.testing.assert_allclose(part.nis, expected, rtol=1e-12)
 
 
+IN_METRES = LINE._replace(residual=lambda z, predicted: 111e3 * (z - predicted))
+WRAPPED = LINE._replace(residual=lambda z, predicted: (z - predicted + 0.5) % 1 - 0.5)
+
+
+def test_noise_is_added_to_values_only_where_it_can_be() -> None:
+    """In other units than the values it is refused, or not a number where that cannot be told."""
+    states, noise = jnp.ones((50, 2)), jnp.array(1e-4)
+
+    def drawn(channel: Channel) -> Any:
+        return measured(jax.random.key(0), channel, noise, states, None)
+
+    np.testing.assert_array_equal(drawn(WRAPPED), drawn(LINE))
+    assert np.all(np.isnan(jax.jit(lambda: drawn(IN_METRES))()))
+    for channel, whole in ((IN_METRES, False), (WRAPPED, True)):
+        model = observing(PROCESS, {"one": channel})
+        own = ModelParams(jnp.array(0.01), {"one": noise})
+        zero, v = jnp.zeros((50, 2)), jnp.full((50, 1), 0.01)
+        _, z = simulate(model, own, states[0], jnp.zeros((50, 0)), zero, v)
+        assert np.all(np.isfinite(z)) == whole
+
+
 NOT_ONE: Any = PROCESS
 LONG = LINE._replace(size=2)
 SEEN = Obs(jnp.ones((2, 3)), jnp.ones((2, 3), bool))
@@ -74,6 +96,10 @@ MISUSE = {
     "a model to be measured": (
         lambda: measured(jax.random.key(0), NOT_ONE, (), jnp.ones((3, 2)), None),
         "channel is Process; it must be a Channel",
+    ),
+    "noise of other units": (
+        lambda: measured(jax.random.key(0), IN_METRES, jnp.array(1.0), jnp.ones((3, 2)), None),
+        "noise cannot be added to its values, whose residual has other units; give the channel",
     ),
     "no channel": (lambda: observing(PROCESS), "there is no channel"),
     "two of one name": (lambda: observing(PROCESS, {"a": LINE}, {"a": BENT}), "two channels 'a'"),

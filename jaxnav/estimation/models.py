@@ -27,7 +27,6 @@ from jaxnav.estimation.types import (
     difference,
     subtract,
 )
-from jaxnav.numerics.roots import semidefinite_root
 
 PROCESS = "process"
 """What a model's parameters of its process go by; no channel can have this name."""
@@ -223,39 +222,17 @@ def observing(
     )
 
 
-def measured(key: Array, channel: Channel, params: Params, states: Point, inputs: Input) -> Array:
-    """Return what a sensor reports along true states ``(T, m)``, with the noise of its channel.
+def disturbed(residual: Callable[[Array, Array], Array], z: Array, v: Array) -> Array:
+    """Return values ``(m,)`` with noise added, not a number where it cannot just be added.
 
-    Args:
-        key: Random key.
-        channel: The sensor.
-        params: Its parameters.
-        states: True states, leading axis ``T``.
-        inputs: Inputs of the steps, leading axis ``T``; ``None`` where the channel needs none.
-
-    Returns:
-        ``(T, m)``; not a number where the noise is no covariance.
-
-    Raises:
-        ValueError: If it is no channel, or what it gives has not its size.
+    That is where the residual of the sum against the values is not the noise, to 1e-6: noise in
+    metres on latitudes in radians, say, but not where angles wrap.
     """
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel is {type(channel).__name__}; it must be a Channel")
-
-    def one(key: Array, x: Point, u: Input) -> Array:
-        noisy = channel.noisy or NonAdditive(
-            lambda params, x, v, u: channel.observe(params, x, u) + v, channel.noise
-        )
-        noise = jnp.asarray(noisy.noise(params, x, u))
-        if not jnp.issubdtype(noise.dtype, jnp.floating):
-            noise = noise.astype(float)
-        white = jax.random.normal(key, noise.shape[:1], noise.dtype)
-        root = semidefinite_root(jnp.diag(noise) if noise.ndim == 1 else noise)
-        v = jnp.where(root.semidefinite, root.factor, jnp.nan) @ white
-        return _sized("to be measured", channel, noisy.observe(params, x, v, u))
-
-    count = jax.tree.leaves(states)[0].shape[0]
-    return jax.vmap(one)(jax.random.split(key, count), states, inputs)
+    moved = z + v
+    if residual is difference:
+        return moved
+    off = residual(moved, z) - v
+    return jnp.where(jnp.all(jnp.abs(off) <= 1e-6 * (jnp.abs(v) + jnp.abs(z))), moved, jnp.nan)
 
 
 def adapted(
@@ -389,7 +366,9 @@ def _noisy(laid_out: list[tuple[str, Channel, slice]], parts: Parts) -> NonAddit
             own, here = parts(params, name), v[first : first + source.shape[0]]
             first += source.shape[0]
             value = (
-                c.observe(own, x, u) + here if c.noisy is None else c.noisy.observe(own, x, here, u)
+                disturbed(c.residual, c.observe(own, x, u), here)
+                if c.noisy is None
+                else c.noisy.observe(own, x, here, u)
             )
             seen.append(_sized(name, c, value))
         return _joined(seen)

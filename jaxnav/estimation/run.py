@@ -13,6 +13,7 @@ from jax.experimental import checkify
 from jaxnav.compiling import compiled
 from jaxnav.estimation.checks import require_filter, require_observations
 from jaxnav.estimation.debugging import check_covariance, checking
+from jaxnav.estimation.models import disturbed
 from jaxnav.estimation.types import Filter, Input, Model, Obs, Params
 from jaxnav.numerics.conditioning import KEPT
 
@@ -184,12 +185,13 @@ def simulate(
         observation_noise: ``(T, m)`` samples, added to the observation.
 
     Returns:
-        The states, leading axis ``T``, and the observations ``(T, m)``.
+        The states, leading axis ``T``, and the observations ``(T, m)``, not a number where noise
+        cannot be added to them (:func:`~jaxnav.estimation.models.disturbed`).
     """
 
     def step(x: Any, now: tuple[Input, Array, Array]) -> tuple[Any, tuple[Any, Array]]:
         u, w, v = now
         x = model.retract(model.transition(params, x, u), w)
-        return x, (x, model.observe(params, x, u) + v)
+        return x, (x, disturbed(model.residual, model.observe(params, x, u), v))
 
     return jax.lax.scan(step, start, (inputs, process_noise, observation_noise))[1]

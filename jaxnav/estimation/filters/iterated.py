@@ -27,11 +27,19 @@ from jaxnav.estimation.filters.innovation import (
     heard_by,
     innovation_info,
     mask_noise,
-    masked_innovation,
 )
 from jaxnav.estimation.filters.kalman import KalmanState, ekf
 from jaxnav.estimation.filters.line_search import Search, step_length
 from jaxnav.estimation.filters.sigma_point import SigmaPointState, ckf
+from jaxnav.estimation.filters.whitened import (
+    Problem,
+    Slope,
+    additive,
+    augmented,
+    cubature,
+    derivative,
+    misfit,
+)
 from jaxnav.estimation.types import (
     Filter,
     FilterParams,
@@ -52,46 +60,14 @@ from jaxnav.numerics.linalg import (
 from jaxnav.numerics.roots import semidefinite_root
 
 
-class _Slope(NamedTuple):
-    """The observation about an iterate, in whitened coordinates; masked channels are zero.
-
-    Attributes:
-        innovation: ``(m,)`` what the mean about the iterate leaves to be explained.
-        A: ``(m, n)`` derivative with respect to the state.
-        G: ``(m, k)`` derivative with respect to the noise in the state; k is 0 if it is not there.
-        R: ``(m, m)`` covariance of the noise.
-        spread_noise: ``(m, m)`` what the linearisation leaves unexplained.
-    """
-
-    innovation: Array
-    A: Array
-    G: Array
-    R: Array
-    spread_noise: Array
-
-
 class _Step(NamedTuple):
     """What an iteration leaves: the slope, the factor of ``S``, the whitened gain ``(n, m)``."""
 
-    slope: _Slope
+    slope: Slope
     S: Array
     root: Cholesky
     gain: Array
     moved: Array
-
-
-class _Problem(NamedTuple):
-    """One update in ``size`` whitened coordinates: the ``states``, then those of augmented noise.
-
-    ``predicted`` maps a point to the observation ``(m,)``, ``noise`` is the covariance that adds;
-    ``sound`` tells whether that of the augmented noise has a root.
-    """
-
-    predicted: Callable[[Array], Array]
-    noise: Array
-    states: int
-    size: int
-    sound: Array
 
 
 class _Form(NamedTuple):
@@ -100,14 +76,14 @@ class _Form(NamedTuple):
     Attributes:
         base: The filter whose ``init`` and ``predict`` are used.
         rebuilt: ``(x, P) -> state``.
-        problem: ``(model, params, x, L, u, told) -> _Problem``.
+        problem: ``(model, params, x, L, u, told) -> Problem``.
         slope: ``(model, problem, obs, point, search) -> (residual's mean, slope, spread noise)``.
     """
 
     base: Filter
     rebuilt: Callable[[Point, Array], Any]
-    problem: Callable[[Model, Params, Point, Array, Input, Heard], _Problem]
-    slope: Callable[[Model, _Problem, Obs, Array, Search], tuple[Array, Array, Array]]
+    problem: Callable[[Model, Params, Point, Array, Input, Heard], Problem]
+    slope: Callable[[Model, Problem, Obs, Array, Search], tuple[Array, Array, Array]]
 
 
 def iterated_ekf(
@@ -123,7 +99,7 @@ def iterated_ekf(
         Bell and Cathey (1993), IEEE Trans. Automatic Control 38(2).
     """
     base = ekf(model)
-    form = _Form(base, _kalman_state, _additive, _derivative)
+    form = _Form(base, _kalman_state, additive, derivative)
     on = partial(iterated_ekf, iterations=iterations, trials=trials, search=search)
     return _iterated(model, form, iterations, trials, search, False, on)
 
@@ -173,7 +149,7 @@ def iterated_ckf(
         (13) and (26) have the wrong sign, and an innovation that is not made anew. All are put
         right here. Arasaratnam and Haykin (2009) for the rule.
     """
-    form = _Form(ckf(model), _sigma_state, _additive, _cubature)
+    form = _Form(ckf(model), _sigma_state, additive, cubature)
     numbers = {"iterations": iterations, "trials": trials, "search": search, "printed": printed}
     return _iterated(model, form, **numbers, on=partial(iterated_ckf, **numbers))
 
@@ -190,9 +166,10 @@ def modified_iterated_ckf(
 
     The points are drawn about the iterate of state and noise together, through
     :attr:`Model.noisy`; ``R`` is part of the augmented covariance and enters nowhere else. For
-    noise that only adds, the noise cancels from every step and the filter is :func:`iterated_ckf`
-    but for the spread of its points; it then has that filter's fixed point in the limit of no
-    spread. Noise that enters ``h`` otherwise is iterated on with the state.
+    noise that only adds (to the residual, where that is no difference of values) it cancels from
+    every step and the filter is :func:`iterated_ckf` but for the spread of its points; it then has
+    that filter's fixed point in the limit of no spread. Noise that enters ``h`` otherwise is
+    iterated on with the state.
 
     Arguments and errors are those of :func:`iterated_ckf`.
 
@@ -200,7 +177,7 @@ def modified_iterated_ckf(
         Shi, Chen, Wang (2023), Eqs. (19)-(28), with the sizes of (19)-(20) put right and without
         the second ``R`` of (23).
     """
-    form = _Form(ckf(model), _sigma_state, _augmented, _cubature)
+    form = _Form(ckf(model), _sigma_state, augmented, cubature)
     numbers = {"iterations": iterations, "trials": trials, "search": search, "printed": printed}
     return _iterated(model, form, **numbers, on=partial(modified_iterated_ckf, **numbers))
 
@@ -278,82 +255,20 @@ def _sigma_state(x: Point, P: Array) -> SigmaPointState:
     return SigmaPointState(x, P, (), jnp.array(False))
 
 
-def _additive(model: Model, params: Params, x: Point, L: Array, u: Input, told: Heard) -> _Problem:
-    """Return the update over the state alone."""
-    n = L.shape[0]
-    sound = jnp.array(True)
-    return _Problem(
-        lambda at: model.observe(params, model.retract(x, L @ at), u), told.noise, n, n, sound
-    )
-
-
-def _augmented(model: Model, params: Params, x: Point, L: Array, u: Input, told: Heard) -> _Problem:
-    """Return the update over the state and the noise of its observation."""
-    n = L.shape[0]
-    if model.noisy is None:
-        observe = lambda params, x, v, u: model.observe(params, x, u) + v  # noqa: E731
-        given = told.noise
-    else:
-        observe, given = model.noisy.observe, model.noisy.noise(params, x, u)
-        # What is infinite belongs to a channel that is missing.
-        given = jnp.where(jnp.isfinite(given), given, 0)
-    root = semidefinite_root(jnp.diag(given) if given.ndim == 1 else given)
-    factor = jnp.where(root.semidefinite, root.factor, 0)
-
-    def predicted(at: Array) -> Array:
-        return observe(params, model.retract(x, L @ at[:n]), factor @ at[n:], u)
-
-    none = jnp.zeros(told.obs.valid.shape, L.dtype)
-    return _Problem(predicted, none, n, n + factor.shape[0], root.semidefinite)
-
-
 def _slope(
-    model: Model, form: _Form, problem: _Problem, obs: Obs, point: Array, search: Search
-) -> _Slope:
+    model: Model, form: _Form, problem: Problem, obs: Obs, point: Array, search: Search
+) -> Slope:
     """Linearise the observation about a point ``(d,)``, masked."""
     n = problem.states
-    nu = masked_innovation(model, obs, problem.predicted(point))
+    nu = misfit(model, problem, obs, point)
     mean, whole, spread_noise = form.slope(model, problem, obs, point, search)
     A, G = whole[:, :n], whole[:, n:]
     R = mask_noise(problem.noise, obs.valid) + G @ G.T
-    return _Slope(nu - mean, A, G, R, spread_noise)
-
-
-def _cubature(
-    model: Model, problem: _Problem, obs: Obs, point: Array, search: Search
-) -> tuple[Array, Array, Array]:
-    """Statistical linearisation by the cubature rule, whose points lie on the axes."""
-    reach = search.spread * problem.size**0.5
-    offsets = reach * jnp.eye(problem.size, dtype=point.dtype)
-    reference = problem.predicted(point)
-
-    def seen(offset: Array) -> Array:
-        residual = model.residual(problem.predicted(point + offset), reference)
-        return jnp.where(obs.valid, residual, 0)
-
-    ahead, behind = jnp.split(jax.vmap(seen)(jnp.concatenate([offsets, -offsets])), 2)
-    even = 0.5 * (ahead + behind)
-    mean = jnp.mean(even, axis=0)
-    scatter = even - mean[None]
-    return mean, (ahead - behind).T / (2 * reach), scatter.T @ scatter / problem.size
-
-
-def _derivative(
-    model: Model, problem: _Problem, obs: Obs, point: Array, search: Search
-) -> tuple[Array, Array, Array]:
-    """Linearisation by the derivative."""
-    del search
-    reference = problem.predicted(point)
-
-    def seen(at: Array) -> Array:
-        return jnp.where(obs.valid, model.residual(problem.predicted(at), reference), 0)
-
-    m = obs.valid.shape[0]
-    return jnp.zeros(m, point.dtype), jax.jacfwd(seen)(point), jnp.zeros((m, m), point.dtype)
+    return Slope(nu - mean, A, G, R, spread_noise)
 
 
 def _gauss_newton(
-    problem: _Problem, slope: _Slope, point: Array, printed: bool
+    problem: Problem, slope: Slope, point: Array, printed: bool
 ) -> tuple[Array, _Step]:
     """Return the full step ``(d,)`` from a point."""
     S = symmetrise(slope.A @ slope.A.T) + slope.R + slope.spread_noise
@@ -369,9 +284,9 @@ def _gauss_newton(
 
 def _search_length(
     model: Model,
-    problem: _Problem,
+    problem: Problem,
     obs: Obs,
-    slope: _Slope,
+    slope: Slope,
     point: Array,
     moved: Array,
     search: Search,
@@ -388,12 +303,12 @@ def _search_length(
 
     def functional(length: Array) -> Array:
         state = point[:n] + length * moved[:n]
-        seen = problem.predicted(jnp.concatenate([state, point[n:]]))
-        whitened = solve_lower(root.factor, masked_innovation(model, obs, seen) + held)
+        here = misfit(model, problem, obs, jnp.concatenate([state, point[n:]]))
+        whitened = solve_lower(root.factor, here + held)
         return jnp.sum(state * state) + jnp.sum(whitened * whitened)
 
-    misfit = slope.innovation + held
-    pull = solve_lower_transposed(root.factor, solve_lower(root.factor, misfit))
+    left = slope.innovation + held
+    pull = solve_lower_transposed(root.factor, solve_lower(root.factor, left))
     promised = 2 * (point[:n] - slope.A.T @ pull) @ moved[:n]
     # Without noise there is no functional to search on.
     length = step_length(functional, promised, search, trials)
