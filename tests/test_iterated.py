@@ -573,7 +573,7 @@ def test_any_number_of_noises(sources: int) -> None:
 
 @each_maker
 def test_noise_is_in_the_units_of_the_residual(name: str) -> None:
-    """Values in degrees with a residual in metres, as latitudes are: the Kalman filter in metres."""
+    """Values in degrees with a residual in metres: the Kalman filter of the metres."""
     rng = np.random.default_rng(5)
     H, R, P = rng.normal(size=(2, 2)), np.diag([4.0, 9.0]), np.array([[30.0, 8.0], [8.0, 20.0]])
     to_metres = 111e3
