@@ -3,18 +3,18 @@
 Imports of JAX and the studies wait until a command needs them, so that help is immediate.
 """
 
-import difflib
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from jaxnav.config import ConfigError, either, near, plain
 from jaxnav.datasets.base import DataError
 from jaxnav.findings import faults
 from jaxnav.studies import STUDIES
-from jaxnav.studies.base import ConfigError, StudyResult, require_x64
+from jaxnav.studies.base import StudyResult, require_x64
 
 OK, BAD_INPUT, DIVERGED, FAULT, INTERRUPTED = 0, 2, 3, 4, 130
 
@@ -32,6 +32,7 @@ commands:
   doctor        versions, devices, 64-bit floats, compilation cache
 
 list, filter and tune take --from FILE: a Python file with filters or wrappers of your own.
+run, tune, filter and allan take --config FILE.toml: their flags by name.
 
 `jaxnav --version` prints the version.
 
@@ -73,18 +74,8 @@ def _dispatch(arguments: list[str]) -> int:
         "doctor": _doctor,
     }
     if command not in commands:
-        raise ConfigError(f"there is no command {command!r}{_near(command, commands)}")
+        raise ConfigError(f"there is no command {command!r}{near(command, commands)}")
     return commands[command](rest)
-
-
-def _either(names: Any) -> str:
-    return "one of " + ", ".join(names)
-
-
-def _near(name: str, names: Iterable[str]) -> str:
-    """Return what a name must be, with the nearest one if it looks like a slip."""
-    close = difflib.get_close_matches(name.lower().replace("_", "-"), names, 1)
-    return f"{f', did you mean {close[0]!r}' if close else ''}; it must be {_either(names)}"
 
 
 def _no_options(command: str, rest: list[str]) -> bool:
@@ -143,11 +134,11 @@ def _doctor(rest: list[str]) -> int:
 
 def _run(rest: list[str]) -> int:
     if not rest or rest[0] in ("-h", "--help"):
-        print(f"usage: jaxnav run STUDY [options]; STUDY is {_either(STUDIES)}")
+        print(f"usage: jaxnav run STUDY [options]; STUDY is {either(STUDIES)}")
         return OK if rest else BAD_INPUT
     name, options = rest[0], rest[1:]
     if name not in STUDIES:
-        raise ConfigError(f"there is no study {name!r}{_near(name, STUDIES)}")
+        raise ConfigError(f"there is no study {name!r}{near(name, STUDIES)}")
     study = STUDIES[name]
     from jaxnav.options import parse_run
 
@@ -183,13 +174,13 @@ def _run(rest: list[str]) -> int:
 def _tune(rest: list[str]) -> int:
     rest = _with_own(rest)
     if not rest or rest[0] in ("-h", "--help"):
-        print(f"usage: jaxnav tune STUDY|LOG [options]; STUDY is {_either(STUDIES)}")
+        print(f"usage: jaxnav tune STUDY|LOG [options]; STUDY is {either(STUDIES)}")
         return OK if rest else BAD_INPUT
     name, options = rest[0], rest[1:]
     recorded = name not in STUDIES
     if recorded and not Path(name).exists():
         raise ConfigError(
-            f"there is no study or log {name!r}{_near(name, STUDIES)} or a recorded drive"
+            f"there is no study or log {name!r}{near(name, STUDIES)} or a recorded drive"
         )
     from jaxnav.options import parse_tune
     from jaxnav.recorded.config import FilterConfig
@@ -204,7 +195,6 @@ def _tune(rest: list[str]) -> int:
     from jaxnav.report.console import Progress, print_document
     from jaxnav.report.tuning import print_parameters, print_tuning
     from jaxnav.results import claim_directory, finite_or_null, write_arrays, write_document
-    from jaxnav.studies.base import plain
     from jaxnav.tuning.analysis import tune
     from jaxnav.tuning.figures import draw
     from jaxnav.tuning.selection import select
@@ -260,9 +250,8 @@ def _filter(rest: list[str]) -> int:
     options = _options_after_log("filter", rest)
     if options is None:
         return BAD_INPUT
-    from jaxnav.options import parse_filter, spread
+    from jaxnav.options import parse_filter
 
-    options = spread(options, "--carry")
     parsed = parse_filter(options)
     if parsed is None:
         return OK

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxnav.config import ConfigError
 from jaxnav.findings import document_of, faults
-from jaxnav.studies.base import ConfigError, StudyResult
+from jaxnav.studies.base import StudyResult
 
 SCHEMA = 1
 

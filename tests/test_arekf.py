@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxnav.config import ConfigError
 from jaxnav.studies.arekf.analysis import GRADES, ratio_map
 from jaxnav.studies.arekf.claims import change
 from jaxnav.studies.arekf.config import ArekfConfig
 from jaxnav.studies.arekf.figures import draw
 from jaxnav.studies.arekf.methods import AXES, KINDS
 from jaxnav.studies.arekf.study import run_campaign, run_study
-from jaxnav.studies.base import ConfigError
 
 
 @pytest.mark.parametrize(

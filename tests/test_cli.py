@@ -43,15 +43,15 @@ BAD = {
         ("calm", "matched-noise", "noise-step", "all"),
     ),
     "unknown flag": (("run", "immae", "--rums", "3"), ("--rums", "--help")),
-    "not a number": (("run", "immae", "--runs", "many"), ("--runs", "'many'", "INT")),
-    "zero runs": (("run", "immae", "--runs", "0"), ("runs is 0", "at least 1")),
+    "not a number": (("run", "immae", "--runs", "many"), ("--runs", "'many'", "a whole number")),
+    "zero runs": (("run", "immae", "--runs", "0"), ("--runs is 0", "from 1 to")),
     "negative noise": (
         ("run", "immae", "--gyro-noise-deg-h", "-1"),
-        ("gyro_noise_deg_h is -1.0", "zero or positive"),
+        ("--gyro-noise-deg-h is -1.0", "zero or more"),
     ),
     "star noise of zero": (
         ("run", "immae", "--star-noise-arcsec", "0"),
-        ("star_noise_arcsec is 0.0", "positive"),
+        ("--star-noise-arcsec is 0.0", "positive"),
     ),
     "theta with a negative entry": (
         ("run", "immae", "--theta", "1", "-10"),

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import FAULT, OK, main
+from jaxnav.config import ConfigError
 from jaxnav.datasets.base import DataError
-from jaxnav.studies.base import ConfigError
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
 from jaxnav.studies.gnss_track.study import run_study
 

@@ -12,6 +12,7 @@ ROOT = Path(jaxnav.__file__).parent
 
 # From the ground up; a module may import from layers before its own and from its own folder's rank.
 ORDER = (
+    "config",
     "units",
     "compiling",
     "program_cache",
@@ -203,7 +204,7 @@ ORDER = (
     "cli",
     "__main__",
 )
-EDGES = {"matplotlib", "rich", "tyro"}
+EDGES = {"matplotlib", "rich"}
 EDGE_MODULES = {"plotting", "report", "doctor", "options"}
 
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from jaxnav.compiling import compiled
+from jaxnav.config import ConfigError
 from jaxnav.navigation.states import LAYOUT, local_total
 from jaxnav.studies.attitude import AXES
-from jaxnav.studies.base import ConfigError, StudyResult
+from jaxnav.studies.base import StudyResult
 from jaxnav.studies.mmae_ukf.config import MmaeUkfConfig
 from jaxnav.studies.mmae_ukf.figures import draw
 from jaxnav.studies.mmae_ukf.methods import (

@@ -16,6 +16,7 @@ import pytest
 from checks import outlying_fixes
 from jaxnav.cli import main
 from jaxnav.compiling import compiled
+from jaxnav.config import ConfigError
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.drive import DriveLog, Reference
 from jaxnav.datasets.formats import load_drive
@@ -30,7 +31,7 @@ from jaxnav.navigation.trajectory.vehicle import Leg, VehicleProfile, drive
 from jaxnav.numerics.lie import so3_exp
 from jaxnav.options import parse_filter
 from jaxnav.recorded.analysis import Report, analyse
-from jaxnav.recorded.config import FilterConfig, check, from_toml
+from jaxnav.recorded.config import FilterConfig, check
 from jaxnav.recorded.figures import draw
 from jaxnav.recorded.methods import member_names, rule_params
 from jaxnav.recorded.motion import still_samples
@@ -38,7 +39,6 @@ from jaxnav.recorded.outputs import write_trajectory
 from jaxnav.recorded.preparation import prepare
 from jaxnav.recorded.scoring import attitude_angles, diverged, horizontal
 from jaxnav.recorded.tuning import likeliest_offset
-from jaxnav.studies.base import ConfigError
 from jaxnav.units import DEG
 
 RATE = 50
@@ -295,12 +295,15 @@ def test_figures_are_drawn(report: Report, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("filtre = 'ekf'", "there is no 'filtre'; it must be one of filter, r_factors"),
+        (
+            "filtre = 'ekf'",
+            "there is no 'filtre', did you mean 'filter'; it must be one of",
+        ),
         ("config = 'x'", "there is no 'config'"),
         ("filter = 3", "filter is 3; it must be a text"),
         ("carry = 'mounting'", "carry is 'mounting'; it must be a list of texts"),
         ("r_factors = 2.0", "r_factors is 2.0; it must be a list of numbers"),
-        ("axle_m = [1.0, 2.0]", r"axle_m is \[1.0, 2.0\]; it must be a list of 3 numbers"),
+        ("axle_m = [1.0, 2.0]", r"axle_m is \[1.0, 2.0\]; it must be three numbers"),
         ("seed = 1.5", "seed is 1.5; it must be a whole number"),
         ("constraints = 1", "constraints is 1; it must be true or false"),
         ("gyro_noise_dps = true", "gyro_noise_dps is True; it must be a number"),
@@ -310,7 +313,7 @@ def test_figures_are_drawn(report: Report, tmp_path: Path) -> None:
 def test_toml_refusals(write: Callable[..., Path], line: str, message: str) -> None:
     path = write(line, name="bank.toml")
     with pytest.raises(ConfigError, match=message) as caught:
-        from_toml(path)
+        parse_filter(["--config", str(path)])
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 

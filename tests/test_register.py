@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from jaxnav.cli import BAD_INPUT, OK, main
+from jaxnav.config import ConfigError
 from jaxnav.estimation import register
 from jaxnav.estimation.register import BANK, FILTER, RULE, WRAPPER, by_kind, chain_of, load
 from jaxnav.navigation.models.kinematic import constant_velocity
 from jaxnav.recorded.config import ALIASES, FilterConfig, parts_of
-from jaxnav.studies.base import ConfigError
 
 ROOT = Path(__file__).parents[1]
 OWN = ROOT / "examples" / "own_wrapper.py"

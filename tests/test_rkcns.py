@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
+from jaxnav.config import ConfigError
 from jaxnav.studies.attitude import AXES
-from jaxnav.studies.base import ConfigError, StudyResult
+from jaxnav.studies.base import StudyResult
 from jaxnav.studies.rkcns.ablations import LINEAR, variations
 from jaxnav.studies.rkcns.claims import POSITION
 from jaxnav.studies.rkcns.config import RkcnsConfig
@@ -29,9 +30,9 @@ BARE = RkcnsConfig(runs=4, duration_s=200.0, ablations=False, cost=False)
         ({"tangent_km": (-1.0, 25.0)}, r"tangent_km is \(-1.0, 25.0\); it must be a lower and a"),
         ({"tangent_km": (20.0, 90.0)}, "between the surface, 0, and the top of the atmosphere, 86"),
         ({"tangent_km": (25.0, 20.0)}, "tangent_km"),
-        ({"stars": -1}, "stars is -1; it must be between 0 and 20"),
+        ({"stars": -1}, "stars is -1; it must be from 0 to 20"),
         ({"density_error": 0.5}, "density_error is 0.5"),
-        ({"iterations": 0}, "iterations is 0; it must be between 1 and 50"),
+        ({"iterations": 0}, "iterations is 0; it must be from 1 to 50"),
         ({"trials": -1}, "trials is -1"),
         ({"start_s": 100.0}, "start_s is 100.0; it must be at least 131 s"),
         ({"duration_s": 900.0}, "duration_s is 900.0; it must be at most 780 s"),

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.config import ConfigError
 from jaxnav.estimation.banks.mixture import moment_match
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.estimation.types import Gaussian
 from jaxnav.navigation.earth import displaced, offset_between
 from jaxnav.navigation.states import SinsLevel, error_form
-from jaxnav.studies.base import ConfigError
 from jaxnav.studies.sage_husa import study
 from jaxnav.studies.sage_husa.claims import NOISY, assess, change
 from jaxnav.studies.sage_husa.config import SageHusaConfig
@@ -28,10 +28,13 @@ pytestmark = pytest.mark.usefixtures("optimised_module")
     ("given", "told"),
     [
         ({"scenario": "calm"}, "scenario is calm; it must be one of tuned, mistuned"),
-        ({"forgetting": (0.9, 1.0)}, "forgetting is .*; it must be between 0 and 1"),
+        (
+            {"forgetting": (0.9, 1.0)},
+            "forgetting is .*; .* numbers, each between 0 and 1",
+        ),
         ({"single_forgetting": 0.9}, "single_forgetting is 0.9; it must be one of the forgetting"),
         ({"q_scales": (0.1, 10.0)}, "q_scales is .*; it must be such that one of them is 1"),
-        ({"r_scales": (1.0, 1.0)}, "r_scales is .*; it must be different numbers"),
+        ({"r_scales": (1.0, 1.0)}, "r_scales is .*; it must be different in every entry"),
         ({"clamp": (2.0, 100.0)}, "clamp is .*; it must be a number below 1 and one above"),
         ({"prior_count": -1.0}, "prior_count is -1.0; it must be zero or more"),
         ({"weight_floor": 0.2}, "weight_floor is 0.2; it must be positive and below 1 / 9"),

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from jaxnav.compiling import compiled
+from jaxnav.config import ConfigError
 from jaxnav.estimation.metrics import mean_interval
 from jaxnav.estimation.tune.fit import fit, value_and_gradient
 from jaxnav.estimation.tune.transforms import POSITIVE, REAL, Transform, between, coordinates
 from jaxnav.estimation.types import Info
 from jaxnav.studies.arekf.config import ArekfConfig
 from jaxnav.studies.arekf.tuning import problem as arekf
-from jaxnav.studies.base import ConfigError
 from jaxnav.studies.gnss_track.config import GnssTrackConfig
 from jaxnav.studies.gnss_track.tuning import problem as gnss_track
 from jaxnav.studies.immae.config import ImmaeConfig

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import BAD_INPUT, OK, main
+from jaxnav.config import ConfigError
 from jaxnav.estimation.tune.transforms import POSITIVE
-from jaxnav.studies.base import ConfigError
 from jaxnav.studies.tuned import Measure, Parameter, Problem
 from jaxnav.tuning.analysis import tune as run_tuning
 from jaxnav.tuning.config import TuneConfig, parse_bounds, parse_start

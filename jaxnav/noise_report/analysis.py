@@ -28,7 +28,7 @@ from jaxnav.navigation.sensors.noise_fit import (
     fit_noise,
     model_variance,
 )
-from jaxnav.noise_report.config import AllanConfig, check
+from jaxnav.noise_report.config import AllanConfig
 from jaxnav.noise_report.rest import (
     coarse,
     doubts,
@@ -73,10 +73,8 @@ def load(path: Path, config: AllanConfig) -> ImuLog:
         config: The parameters.
 
     Raises:
-        ConfigError: If a parameter is out of its range.
         DataError: If the log is refused, or by :func:`prepare`.
     """
-    check(config)
     return prepare(load_imu_csv(path), config)
 
 
@@ -85,7 +83,7 @@ def prepare(log: ImuLog, config: AllanConfig) -> ImuLog:
 
     Args:
         log: A log as it was recorded.
-        config: The parameters, checked.
+        config: The parameters.
 
     Raises:
         DataError: If the part is too short, its gaps are not told from jitter, or it is doubtful

@@ -1,9 +1,11 @@
 """What `jaxnav allan` may be told about the analysis, free of JAX."""
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
-from jaxnav.studies.base import require
+from msgspec import Meta
+
+from jaxnav.config import NotNegative, Probability, check_fields, require
 
 
 @dataclass(frozen=True)
@@ -19,18 +21,19 @@ class AllanConfig:
             an unlikely unit; the doubts are then notes. What no sensor gives stays refused.
     """
 
-    start_s: float = 0.0
+    start_s: NotNegative = 0.0
     end_s: float | None = None
-    confidence: float = 0.95
-    per_octave: int = 1
+    confidence: Probability = 0.95
+    per_octave: Annotated[int, Meta(ge=1, le=8)] = 1
     accept_doubts: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing.
 
-def check(config: AllanConfig) -> None:
-    """Raise :class:`~jaxnav.studies.base.ConfigError` if a parameter is out of its range."""
-    require(0 <= config.start_s < math.inf, "start_s", config.start_s, "zero or positive")
-    if config.end_s is not None:
-        accepted = f"after start_s, which is {config.start_s}"
-        require(config.start_s < config.end_s < math.inf, "end_s", config.end_s, accepted)
-    require(0 < config.confidence < 1, "confidence", config.confidence, "between 0 and 1")
-    require(1 <= config.per_octave <= 8, "per_octave", config.per_octave, "from 1 to 8")
+        Raises:
+            ConfigError: With one sentence naming the field, its value and what is accepted.
+        """
+        check_fields(self)
+        if self.end_s is not None:
+            accepted = f"after start_s, which is {self.start_s}"
+            require(self.start_s < self.end_s, "end_s", self.end_s, accepted)

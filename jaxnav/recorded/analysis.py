@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from jaxnav.config import plain
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.run import run
 from jaxnav.estimation.types import Flag
@@ -36,7 +37,6 @@ from jaxnav.recorded.scoring import (
     rms,
 )
 from jaxnav.results import SCHEMA, provenance
-from jaxnav.studies.base import plain
 from jaxnav.units import DEG
 
 NIS_CONFIDENCE = 0.95

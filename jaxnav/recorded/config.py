@@ -1,18 +1,23 @@
-"""What `jaxnav filter` may be told, by flags or by a TOML file with the same names, free of JAX."""
+"""What `jaxnav filter` may be told, free of JAX."""
 
-import tomllib
-from dataclasses import dataclass, fields
-from difflib import get_close_matches
+from dataclasses import dataclass
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal
 
-from jaxnav.studies.base import (
+from msgspec import Meta
+
+from jaxnav.config import (
     ConfigError,
+    Count,
+    Names,
+    Positive,
+    Positives,
+    Probability,
+    Seed,
+    Share,
+    check_fields,
+    near,
     require,
-    require_choice,
-    require_finite,
-    require_positive,
 )
 
 ALIASES = {
@@ -95,47 +100,62 @@ class FilterConfig:
 
     config: Path | None = None
     filter: str = "ekf"
-    r_factors: tuple[float, ...] = (1.0,)
-    q_factors: tuple[float, ...] = (1.0,)
-    forgetting: tuple[float, ...] = (0.97,)
+    r_factors: Positives = (1.0,)
+    q_factors: Positives = (1.0,)
+    forgetting: Annotated[tuple[Share, ...], Meta(min_length=1)] = (0.97,)
     rule: RuleName = "floor"
-    weight_floor: float = 1e-3
-    rule_time_s: float = 10.0
-    gyro_noise_dps: float = 0.1
-    accel_noise_ug: float = 2000.0
-    gyro_walk_dps: float = 0.002
-    accel_walk_ug: float = 100.0
-    position_sigma_m: float = 0.03
-    velocity_sigma: float = 0.08
+    weight_floor: Positive = 1e-3
+    rule_time_s: Positive = 10.0
+    gyro_noise_dps: Positive = 0.1
+    accel_noise_ug: Positive = 2000.0
+    gyro_walk_dps: Positive = 0.002
+    accel_walk_ug: Positive = 100.0
+    position_sigma_m: Positive = 0.03
+    velocity_sigma: Positive = 0.08
     time_offset_s: float = 0.0
     tune_offset: bool = False
-    rate_hz: float | None = None
+    rate_hz: Positive | None = None
     constraints: bool = True
-    steered_sigma: float = 0.25
-    steered_rate_hz: float = 10.0
-    rest_sigma: float = 0.05
-    rest_speed: float = 1.0
+    steered_sigma: Positive = 0.25
+    steered_rate_hz: Positive = 10.0
+    rest_sigma: Positive = 0.05
+    rest_speed: Positive = 1.0
     axle_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mounting_deg: tuple[float, float, float] | None = None
-    stop_gyro_dps: float = 0.8
-    stop_accel: float = 0.06
-    stop_time_s: float = 2.0
-    carry: tuple[str, ...] = ()
+    stop_gyro_dps: Positive = 0.8
+    stop_accel: Positive = 0.06
+    stop_time_s: Positive = 2.0
+    carry: Names = ()
     gate: bool = True
-    gate_false_alarm: float = 1e-9
-    gate_patience: float = 5.0
+    gate_false_alarm: Probability = 1e-9
+    gate_patience: Positive = 5.0
     strict: bool = False
-    align_speed: float = 3.0
+    align_speed: Positive = 3.0
     outages: When = "auto"
-    outage_s: float = 15.0
-    outage_every_s: float = 35.0
+    outage_s: Positive = 15.0
+    outage_every_s: Positive = 35.0
     added_noise: bool = False
     noise_start_s: tuple[float, ...] = (120.0, 320.0)
     noise_end_s: tuple[float, ...] = (220.0, 420.0)
-    noise_sigma_m: tuple[float, ...] = (6.0, 9.0)
-    noise_runs: int = 10
-    noise_rate_hz: float = 10.0
-    seed: int = 0
+    noise_sigma_m: Positives = (6.0, 9.0)
+    noise_runs: Count = 10
+    noise_rate_hz: Positive = 10.0
+    seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing.
+
+        Raises:
+            ConfigError: With one sentence naming the field, its value and what is accepted.
+        """
+        check_fields(self)
+        count = members(self)
+        accepted = f"positive and below the equal weight of the {count} members"
+        require(self.weight_floor < 1 / count, "weight_floor", self.weight_floor, accepted)
+        accepted = f"above outage_s, which is {self.outage_s}"
+        above = self.outage_every_s > self.outage_s
+        require(above, "outage_every_s", self.outage_every_s, accepted)
+        _check_spans(self)
 
 
 ALONE: dict[str, Any] = {
@@ -150,43 +170,18 @@ ALONE: dict[str, Any] = {
 
 
 def check(config: FilterConfig) -> None:
-    """Raise :class:`~jaxnav.studies.base.ConfigError` if a parameter is out of its range."""
-    require_finite(config)
-    require_choice(config, "rule", "outages")
-    require_positive(
-        config,
-        *("r_factors", "q_factors", "forgetting", "rule_time_s"),
-        *("gyro_noise_dps", "accel_noise_ug", "gyro_walk_dps", "accel_walk_ug"),
-        *("position_sigma_m", "velocity_sigma", "steered_sigma", "steered_rate_hz", "rest_sigma"),
-        *("rest_speed", "gate_false_alarm", "gate_patience"),
-        *("stop_gyro_dps", "stop_accel", "stop_time_s", "align_speed", "outage_s"),
-        *("noise_sigma_m", "noise_rate_hz"),
-    )
-    good = all(b <= 1 for b in config.forgetting)
-    require(good, "forgetting", config.forgetting, "in (0, 1]")
+    """Hold a configuration against the filters that there are.
+
+    Raises:
+        ConfigError: If there is no such filter, or it has no use for what is given.
+    """
     require(
         len(config.forgetting) == 1 or "sage_husa" in parts_of(config.filter),
         "forgetting",
         config.forgetting,
         f"one factor for {config.filter}; several make a bank of sage_husa(...)",
     )
-    accepted = "above 0 and below 1"
-    require(config.gate_false_alarm < 1, "gate_false_alarm", config.gate_false_alarm, accepted)
-    count = members(config)
-    accepted = f"positive and below the equal weight of the {count} members"
-    require(0 < config.weight_floor < 1 / count, "weight_floor", config.weight_floor, accepted)
-    if config.rate_hz is not None:
-        require(config.rate_hz > 0, "rate_hz", config.rate_hz, "positive")
-    require(
-        config.outage_every_s > config.outage_s,
-        "outage_every_s",
-        config.outage_every_s,
-        f"above outage_s, which is {config.outage_s}",
-    )
     _check_carry(config)
-    _check_spans(config)
-    require(config.noise_runs >= 1, "noise_runs", config.noise_runs, "at least 1")
-    require(0 <= config.seed < 2**63, "seed", config.seed, "between 0 and 2**63 - 1")
 
 
 def parts_of(name: str) -> tuple[str, ...]:
@@ -213,9 +208,8 @@ def _check_carry(config: FilterConfig) -> None:
     from jaxnav.recorded.carry import CARRIES
 
     for name in config.carry:
-        near = get_close_matches(name, CARRIES, 1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        require(name in CARRIES, "carry", name + hint, "one of " + ", ".join(CARRIES))
+        if name not in CARRIES:
+            raise ConfigError(f"carry is {name}{near(name, CARRIES)}")
     once = len(set(config.carry)) == len(config.carry)
     require(once, "carry", ", ".join(config.carry), "each state once")
     seen = config.constraints or "mounting" not in config.carry
@@ -234,57 +228,3 @@ def _check_spans(config: FilterConfig) -> None:
         config.noise_end_s,
         f"after noise_start_s, which is {config.noise_start_s} and not negative",
     )
-
-
-def from_toml(path: Path) -> FilterConfig:
-    """Return the configuration of a TOML file: names of :class:`FilterConfig` with their values.
-
-    Raises:
-        ConfigError: If the file cannot be read, or has a name or a type that is not accepted.
-    """
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise ConfigError(f"{path}: {reason}; it must be a readable TOML file") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        said = str(error).splitlines()[0]
-        raise ConfigError(f"{path} is not TOML: {said}; it must be a TOML file") from None
-    kinds = get_type_hints(FilterConfig)
-    names = [field.name for field in fields(FilterConfig) if field.name != "config"]
-    given: dict[str, Any] = {"config": path}
-    for name, value in document.items():
-        if name not in names:
-            raise ConfigError(f"{path}: there is no {name!r}; it must be one of {', '.join(names)}")
-        given[name] = _typed(f"{path}: {name}", kinds[name], value)
-    return FilterConfig(**given)
-
-
-def _typed(name: str, kind: Any, value: Any) -> Any:
-    """Return a value of a TOML file as the field's type."""
-    if NoneType in get_args(kind):
-        kind = get_args(kind)[0]
-    if get_origin(kind) is Literal:
-        require(value in get_args(kind), name, repr(value), "one of " + ", ".join(get_args(kind)))
-        return value
-    if get_origin(kind) is tuple:
-        parts = get_args(kind)
-        if parts[0] is str:
-            good = isinstance(value, list) and all(isinstance(entry, str) for entry in value)
-            require(good, name, repr(value), "a list of texts")
-            return tuple(value)
-        length = None if parts[1] is Ellipsis else len(parts)
-        accepted = "a list of numbers" if length is None else f"a list of {length} numbers"
-        good = isinstance(value, list) and all(_is_number(entry) for entry in value)
-        require(good and length in (None, len(value)), name, repr(value), accepted)
-        return tuple(float(entry) for entry in value)
-    if kind is float:
-        require(_is_number(value), name, repr(value), "a number")
-        return float(value)
-    accepted = {bool: "true or false", int: "a whole number", str: "a text"}[kind]
-    require(type(value) is kind, name, repr(value), accepted)
-    return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.config import ConfigError
 from jaxnav.estimation.banks.mixture import BankParams, bank
 from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import (
@@ -42,7 +43,6 @@ from jaxnav.navigation.states import STATES, ErrorForm, LevelError, SinsLevel, e
 from jaxnav.recorded.carry import carried, laws
 from jaxnav.recorded.config import FilterConfig, members, parts_of
 from jaxnav.recorded.preparation import Drive
-from jaxnav.studies.base import ConfigError
 from jaxnav.units import DEG, GRAVITY
 
 ERRORS: dict[str, LevelError] = {"liekf": "left-invariant", "se23-ekf": "right-invariant"}

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.compiling import compiled
+from jaxnav.config import ConfigError
 from jaxnav.datasets.drive import DriveLog
 from jaxnav.estimation.run import run
 from jaxnav.estimation.tune.losses import negative_log_likelihood
@@ -21,7 +22,6 @@ from jaxnav.recorded.config import FilterConfig, members, parts_of
 from jaxnav.recorded.methods import filter_params, method
 from jaxnav.recorded.offset import likeliest_offset
 from jaxnav.recorded.preparation import Drive, prepare
-from jaxnav.studies.base import ConfigError
 from jaxnav.studies.tuned import Measure, Parameter, Problem, Values
 
 BLOCK_S = 30.0

@@ -9,6 +9,7 @@ import optax
 from jax import Array
 
 from jaxnav.compiling import compiled
+from jaxnav.config import ConfigError, plain
 from jaxnav.estimation.metrics import Interval, mean, mean_interval, rmse, rmse_ratio
 from jaxnav.estimation.tune.fit import Fit, StartError, Validation, fit, fit_lbfgs
 from jaxnav.estimation.tune.inspect import (
@@ -21,7 +22,6 @@ from jaxnav.estimation.tune.inspect import (
 )
 from jaxnav.findings import document_of, faults
 from jaxnav.results import SCHEMA, provenance
-from jaxnav.studies.base import ConfigError, plain
 from jaxnav.studies.tuned import Measure, Problem
 from jaxnav.tuning.config import TuneConfig
 from jaxnav.tuning.selection import Selection, select

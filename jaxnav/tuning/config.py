@@ -2,9 +2,11 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from jaxnav.studies.base import ConfigError, require, require_choice
+from msgspec import Meta
+
+from jaxnav.config import ConfigError, Count, Names, Positive, Seed, check_fields, require
 
 VALUES = "as NAME=VALUE, or NAME=VALUE,VALUE,... of an array"
 BOUNDS = "as NAME=LOW:HIGH"
@@ -35,19 +37,19 @@ class TuneConfig:
     """
 
     list: bool = False
-    params: tuple[str, ...] = ()
+    params: Names = ()
     start: tuple[str, ...] = ()
     bounds: tuple[str, ...] = ()
     optimiser: Literal["adam", "lbfgs"] | None = None
-    steps: int | None = None
-    rate: float | None = None
-    runs: int | None = None
-    seed: int = 0
-    validation_runs: int | None = None
-    patience: int = 6
-    held_out_runs: int = 100
+    steps: Count | None = None
+    rate: Positive | None = None
+    runs: Count | None = None
+    seed: Seed = 0
+    validation_runs: Count | None = None
+    patience: Count = 6
+    held_out_runs: Annotated[int, Meta(ge=2)] = 100
     check_gradient: bool = False
-    profile_points: int = 5
+    profile_points: Annotated[int, Meta(ge=0)] = 5
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing.
@@ -55,15 +57,7 @@ class TuneConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "optimiser")
-        for name in ("steps", "runs", "validation_runs"):
-            value = getattr(self, name)
-            require(value is None or value >= 1, name, value, "at least 1")
-        if self.rate is not None:
-            require(0 < self.rate < math.inf, "rate", self.rate, "positive")
-        require(0 <= self.seed < 2**63, "seed", self.seed, "between 0 and 2**63 - 1")
-        require(self.patience >= 1, "patience", self.patience, "at least 1")
-        require(self.held_out_runs >= 2, "held_out_runs", self.held_out_runs, "at least 2")
+        check_fields(self)
         points = self.profile_points
         odd = points == 0 or (points >= 3 and points % 2 == 1)
         require(odd, "profile_points", points, "0, or odd and at least 3")

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav.config import ConfigError, require
 from jaxnav.estimation.tune.transforms import FIXED, Transform, between, coordinates
-from jaxnav.studies.base import ConfigError, require
 from jaxnav.studies.tuned import Parameter, Problem
 from jaxnav.tuning.config import TuneConfig, parse_bounds, parse_start
 

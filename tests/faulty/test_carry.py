@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import BAD_INPUT, main
+from jaxnav.config import ConfigError
 from jaxnav.recorded.analysis import Report, analyse
 from jaxnav.recorded.config import FilterConfig, check
-from jaxnav.studies.base import ConfigError
 from tests.faulty.car import drive, logged
 
 CONFIG = FilterConfig(rate_hz=10.0, outages="off", position_sigma_m=0.5, velocity_sigma=0.1)
@@ -52,7 +52,7 @@ def test_channels_are_told_apart_in_the_summary(report: Report) -> None:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"carry": ("lever-am",)}, r"^carry is lever-am \(did you mean lever-arm\?\); it must be"),
+        ({"carry": ("lever-am",)}, r"^carry is lever-am, did you mean 'lever-arm'; it must be"),
         ({"carry": ("mounting", "mounting")}, r"^carry is mounting, mounting; it must be each st"),
         (
             {"carry": ("mounting",), "constraints": False},

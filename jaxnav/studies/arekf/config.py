@@ -1,14 +1,20 @@
 """Configuration of the study ``arekf``: what the paper prints, and what it leaves open."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from jaxnav.studies.base import (
+from msgspec import Meta
+
+from jaxnav.config import (
+    NotNegative,
+    Positive,
+    PositiveAxes,
+    Positives,
+    Runs,
+    Seed,
+    check_fields,
     require,
-    require_choice,
-    require_finite,
-    require_positive,
-    require_runs,
+    require_different,
 )
 
 SCENARIOS = {
@@ -96,32 +102,32 @@ class ArekfConfig:
     scenario: Literal[
         "noise-drift", "bias-dominated", "r-sweep", "outliers", "large-heading-error", "all"
     ] = "noise-drift"
-    runs: int = 150
-    seed: int = 0
-    duration_s: float = 120.0
-    align_s: float = 60.0
-    ins_rate_hz: float = 400.0
-    gnss_rate_hz: float = 10.0
-    filter_period_s: float = 0.1
-    factors: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
-    reported: float = 10.0
-    arw_deg_sqrt_h: float | None = None
-    vrw_m_s_sqrt_h: float | None = None
-    gyro_drift_deg_h: float | None = None
-    accel_bias_mg: float | None = None
-    gnss_velocity: float | None = None
-    gnss_position: float = 3.0
-    p0_attitude_deg: tuple[float, float, float] = (0.1, 0.1, 0.5)
-    p0_velocity: float = 0.1
-    p0_position: float = 3.0
-    heading_deg: float = 60.0
-    settle_s: float = 10.0
-    outlier_share: float = 0.05
-    outlier_scale: float = 10.0
-    r_factors: tuple[float, ...] = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
-    versoria_width: float = 0.05
-    versoria_power: float = 2.0
-    iae_memory: float = 20.0
+    runs: Runs = 150
+    seed: Seed = 0
+    duration_s: Positive = 120.0
+    align_s: Positive = 60.0
+    ins_rate_hz: Positive = 400.0
+    gnss_rate_hz: Positive = 10.0
+    filter_period_s: Positive = 0.1
+    factors: Positives = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
+    reported: Positive = 10.0
+    arw_deg_sqrt_h: Positive | None = None
+    vrw_m_s_sqrt_h: Positive | None = None
+    gyro_drift_deg_h: Positive | None = None
+    accel_bias_mg: Positive | None = None
+    gnss_velocity: Positive | None = None
+    gnss_position: Positive = 3.0
+    p0_attitude_deg: PositiveAxes = (0.1, 0.1, 0.5)
+    p0_velocity: Positive = 0.1
+    p0_position: Positive = 3.0
+    heading_deg: Annotated[float, Meta(gt=0, le=90)] = 60.0
+    settle_s: NotNegative = 10.0
+    outlier_share: Annotated[float, Meta(ge=0, lt=0.5)] = 0.05
+    outlier_scale: Positive = 10.0
+    r_factors: Positives = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
+    versoria_width: NotNegative = 0.05
+    versoria_power: Positive = 2.0
+    iae_memory: Annotated[float, Meta(ge=1)] = 20.0
     analysis: bool = True
     cost: bool = True
 
@@ -131,33 +137,19 @@ class ArekfConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "scenario")
-        require_finite(self)
-        require_runs(self)
-        require_positive(self, *_POSITIVE)
-        for name in _OPTIONAL:
-            value = getattr(self, name)
-            require(value is None or value > 0, name, value, "positive")
+        check_fields(self)
         self._require_rates()
+        require_different(self, "factors", "r_factors")
         for name in ("factors", "r_factors"):
             value = getattr(self, name)
-            require(len(set(value)) == len(value), name, value, "different numbers")
             require(1.0 in value, name, value, "such that one of them is 1")
         require(self.reported in self.factors, "reported", self.reported, "one of the factors")
         require(
-            len(self.p0_attitude_deg) == 3, "p0_attitude_deg", self.p0_attitude_deg, "three numbers"
-        )
-        require(self.heading_deg <= 90, "heading_deg", self.heading_deg, "at most 90")
-        require(
-            0 <= self.settle_s < self.duration_s,
+            self.settle_s < self.duration_s,
             "settle_s",
             self.settle_s,
             f"zero or more, and below the duration of {self.duration_s:g} s",
         )
-        share = self.outlier_share
-        require(0 <= share < 0.5, "outlier_share", share, "in [0, 0.5)")
-        require(self.versoria_width >= 0, "versoria_width", self.versoria_width, "zero or more")
-        require(self.iae_memory >= 1, "iae_memory", self.iae_memory, "at least 1")
 
     def _require_rates(self) -> None:
         """Require that rates and durations are whole numbers of each other's periods."""
@@ -235,20 +227,3 @@ _OPTIONAL = {
     "accel_bias_mg": "bias",
     "gnss_velocity": "velocity",
 }
-_POSITIVE = (
-    "duration_s",
-    "align_s",
-    "ins_rate_hz",
-    "gnss_rate_hz",
-    "filter_period_s",
-    "factors",
-    "reported",
-    "gnss_position",
-    "p0_attitude_deg",
-    "p0_velocity",
-    "p0_position",
-    "heading_deg",
-    "outlier_scale",
-    "r_factors",
-    "versoria_power",
-)

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxnav.config import plain
 from jaxnav.estimation.metrics import chi2_mean_bounds, rmse
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
 from jaxnav.navigation.states import STATES
@@ -16,7 +17,7 @@ from jaxnav.studies.arekf.cost import step_latencies
 from jaxnav.studies.arekf.methods import AXES, KINDS, METHODS, run_one, setup_of, shared_of
 from jaxnav.studies.arekf.simulation import build_world
 from jaxnav.studies.arekf.sweep import labels_of, run_sweep
-from jaxnav.studies.base import StudyResult, plain, run_scenarios
+from jaxnav.studies.base import StudyResult, run_scenarios
 from jaxnav.studies.timing import Latency
 from jaxnav.units import DEG
 

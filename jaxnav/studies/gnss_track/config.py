@@ -4,15 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from jaxnav.studies.base import (
-    require,
-    require_choice,
-    require_finite,
-    require_positive,
-    require_probability,
-    require_reset,
-    require_weight_floor,
-)
+from jaxnav.config import Positive, Positives, Probability, Seed, Share, check_fields, require
+from jaxnav.studies.base import require_weight_floor
 
 SCENARIOS = {
     "full-rate": "every fix of the log",
@@ -42,15 +35,15 @@ class GnssTrackConfig:
 
     log: Path | None = None
     scenario: Literal["full-rate", "thinned", "all"] = "full-rate"
-    thin_period_s: float = 1.0
-    q: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0)
-    position_sigma: float = 0.02
-    initial_speed_sigma: float = 10.0
-    reset_period_s: float = 5.0
-    reset_threshold: float = 0.9
-    weight_floor: float = 1e-3
-    switching: float = 0.02
-    seed: int = 0
+    thin_period_s: Positive = 1.0
+    q: Positives = (0.01, 0.1, 1.0, 10.0)
+    position_sigma: Positive = 0.02
+    initial_speed_sigma: Positive = 10.0
+    reset_period_s: Positive = 5.0
+    reset_threshold: Share = 0.9
+    weight_floor: Positive = 1e-3
+    switching: Probability = 0.02
+    seed: Seed = 0
     strict: bool = False
 
     def __post_init__(self) -> None:
@@ -59,17 +52,10 @@ class GnssTrackConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "scenario")
-        require_finite(self)
-        require_positive(
-            self, "thin_period_s", "position_sigma", "initial_speed_sigma", "reset_period_s"
-        )
-        require_positive(self, "q")
+        check_fields(self)
         names = self.single_ids
         require(len(set(names)) == len(names), "q", self.q, "different in every entry")
-        require_reset(self, 0.0)
         require_weight_floor(self, len(self.q))
-        require_probability(self, "switching")
 
     @property
     def single_ids(self) -> tuple[str, ...]:

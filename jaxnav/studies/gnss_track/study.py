@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.config import ConfigError, plain
 from jaxnav.datasets.base import DataError
 from jaxnav.datasets.plausible import check_fixes
 from jaxnav.datasets.rtklib import load_rtklib_pos
@@ -28,7 +29,7 @@ from jaxnav.navigation.models.kinematic import (
     KinematicParams,
     constant_velocity,
 )
-from jaxnav.studies.base import ConfigError, StudyResult, plain, require_x64
+from jaxnav.studies.base import StudyResult, require_x64
 from jaxnav.studies.gnss_track.config import SCENARIOS, GnssTrackConfig
 
 MODEL = constant_velocity(axes=2)

@@ -3,17 +3,18 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxnav.studies.base import (
-    require,
-    require_choice,
-    require_finite,
-    require_flight_times,
-    require_positive,
-    require_probability,
-    require_reset,
-    require_runs,
-    require_weight_floor,
+from jaxnav.config import (
+    Latitude,
+    NotNegative,
+    Positive,
+    Positives,
+    Probability,
+    Runs,
+    Seed,
+    Share,
+    check_fields,
 )
+from jaxnav.studies.base import require_flight_times, require_reset, require_weight_floor
 
 SCENARIOS = {
     "matched-noise": "noise as nominal, and a single filter that believes four times that",
@@ -60,34 +61,34 @@ class ImmaeConfig:
     """
 
     scenario: Literal["matched-noise", "noise-step", "all"] = "noise-step"
-    runs: int = 100
-    seed: int = 0
+    runs: Runs = 100
+    seed: Seed = 0
     chain: Literal["sins", "linear"] = "sins"
     initial: Literal["table", "drawn"] = "table"
-    duration_s: float = 600.0
-    ins_rate_hz: float = 100.0
-    filter_period_s: float = 0.05
+    duration_s: Positive = 600.0
+    ins_rate_hz: Positive = 100.0
+    filter_period_s: Positive = 0.05
     initial_pitch_deg: float = 90.0
-    latitude_deg: float = 39.98
+    latitude_deg: Latitude = 39.98
     longitude_deg: float = 116.34
-    gyro_noise_deg_h: float = 1.0
-    accel_noise_ug: float = 500.0
+    gyro_noise_deg_h: NotNegative = 1.0
+    accel_noise_ug: NotNegative = 500.0
     gyro_drift_deg_h: float = 0.5
     accel_bias_ug: float = 100.0
-    star_noise_arcsec: float = 1.0
+    star_noise_arcsec: Positive = 1.0
     initial_misalignment_arcsec: tuple[float, float, float] = (10.0, 6.0, 10.0)
-    p0_attitude_arcsec: float = 10.0
-    p0_velocity: float = 0.1
-    p0_position: float = 5.0
-    p0_drift_deg_h: float = 0.5
-    p0_bias_ug: float = 500.0
-    theta: tuple[float, ...] = (1.0, 10.0, 100.0, 1000.0, 10000.0)
-    kf_theta: float | None = None
-    step_theta: float = 10.0
-    reset_period_s: float = 10.0
-    reset_threshold: float = 0.9
-    weight_floor: float = 1e-6
-    switching: float = 1e-4
+    p0_attitude_arcsec: Positive = 10.0
+    p0_velocity: Positive = 0.1
+    p0_position: Positive = 5.0
+    p0_drift_deg_h: Positive = 0.5
+    p0_bias_ug: Positive = 500.0
+    theta: Positives = (1.0, 10.0, 100.0, 1000.0, 10000.0)
+    kf_theta: Positive | None = None
+    step_theta: Positive = 10.0
+    reset_period_s: Positive = 10.0
+    reset_threshold: Share = 0.9
+    weight_floor: Positive = 1e-6
+    switching: Probability = 1e-4
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing.
@@ -95,19 +96,10 @@ class ImmaeConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "scenario", "chain", "initial")
-        require_finite(self)
-        require_runs(self)
-        require_positive(self, *_POSITIVE)
+        check_fields(self)
         require_flight_times(self)
-        for name in ("gyro_noise_deg_h", "accel_noise_ug"):
-            value = getattr(self, name)
-            require(0 <= value < float("inf"), name, value, "zero or positive")
-        if self.kf_theta is not None:
-            require(self.kf_theta > 0, "kf_theta", self.kf_theta, "positive")
         require_reset(self, self.filter_period_s)
         require_weight_floor(self, len(self.theta))
-        require_probability(self, "switching")
 
     @property
     def steps(self) -> int:
@@ -130,18 +122,3 @@ class ImmaeConfig:
         if self.kf_theta is not None:
             return self.kf_theta
         return 4.0 if self.scenario == "matched-noise" else 1.0
-
-
-_POSITIVE = (
-    "theta",
-    "duration_s",
-    "ins_rate_hz",
-    "filter_period_s",
-    "star_noise_arcsec",
-    "p0_attitude_arcsec",
-    "p0_velocity",
-    "p0_position",
-    "p0_drift_deg_h",
-    "p0_bias_ug",
-    "step_theta",
-)

@@ -6,9 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxnav.config import plain
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
 from jaxnav.studies.attitude import attitude_arrays, attitude_measures
-from jaxnav.studies.base import StudyResult, plain, run_scenarios
+from jaxnav.studies.base import StudyResult, run_scenarios
 from jaxnav.studies.immae.claims import PUBLISHED, assess
 from jaxnav.studies.immae.config import SCENARIOS, ImmaeConfig
 from jaxnav.studies.immae.methods import (

@@ -1,24 +1,32 @@
 """Configuration of the study ``mmae-ukf``: what the paper states and what it leaves open."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from jaxnav.studies.base import (
+from msgspec import Meta
+
+from jaxnav.config import (
+    Count,
+    Latitude,
+    NotNegative,
+    Positive,
+    Probability,
+    Runs,
+    Seed,
+    Share,
+    check_fields,
     require,
-    require_choice,
-    require_finite,
-    require_flight_times,
-    require_positive,
-    require_probability,
-    require_reset,
-    require_runs,
 )
+from jaxnav.studies.base import require_flight_times, require_reset
 
 SCENARIOS = {
     "paper": "true noise 1/2, 1, 2 times nominal in the three thirds of the flight",
     "reversed": "true noise 2, 1, 1/2 times nominal",
     "large-misalignment": "as paper, with an initial attitude error of many degrees",
 }
+
+STATES = 15
+"""Tangent coordinates of the state."""
 
 
 @dataclass(frozen=True)
@@ -64,32 +72,32 @@ class MmaeUkfConfig:
     """
 
     scenario: Literal["paper", "reversed", "large-misalignment", "all"] = "paper"
-    runs: int = 100
-    seed: int = 0
+    runs: Runs = 100
+    seed: Seed = 0
     star: Literal["rotation-vector", "euler"] | None = None
-    duration_s: float = 300.0
-    ins_rate_hz: float = 100.0
-    filter_period_s: float = 0.05
-    latitude_deg: float = 40.0
-    gyro_noise_deg_h: float = 20.0
-    accel_noise_ug: float = 50.0
-    accel_error_ug: float = 50.0
-    accel_error_time_s: float = 300.0
-    star_noise_arcsec: float = 5.0
-    p0_attitude_arcsec: float = 10.0
-    p0_velocity: float = 0.1
-    p0_position: float = 5.0
-    p0_drift_deg_h: float = 0.5
-    misalignment_deg: float = 20.0
-    settle_s: float = 10.0
-    models: int = 10
-    model_range: tuple[float, float] = (0.25, 4.0)
-    reset_period_s: float = 10.0
-    reset_threshold: float = 0.3
-    switching: float = 1e-3
+    duration_s: Positive = 300.0
+    ins_rate_hz: Positive = 100.0
+    filter_period_s: Positive = 0.05
+    latitude_deg: Latitude = 40.0
+    gyro_noise_deg_h: Positive = 20.0
+    accel_noise_ug: Positive = 50.0
+    accel_error_ug: Positive = 50.0
+    accel_error_time_s: Positive = 300.0
+    star_noise_arcsec: Positive = 5.0
+    p0_attitude_arcsec: Positive = 10.0
+    p0_velocity: Positive = 0.1
+    p0_position: Positive = 5.0
+    p0_drift_deg_h: Positive = 0.5
+    misalignment_deg: Annotated[float, Meta(gt=0, le=90)] = 20.0
+    settle_s: NotNegative = 10.0
+    models: Count = 10
+    model_range: tuple[Positive, Positive] = (0.25, 4.0)
+    reset_period_s: Positive = 10.0
+    reset_threshold: Share = 0.3
+    switching: Probability = 1e-3
     alpha: float = 1.0
     beta: float = 2.0
-    kappa: float = 0.0
+    kappa: Annotated[float, Meta(gt=-STATES)] = 0.0
     cost: bool = True
 
     def __post_init__(self) -> None:
@@ -98,22 +106,12 @@ class MmaeUkfConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "scenario", "star")
-        require_finite(self)
-        require_runs(self)
-        require_positive(self, *_POSITIVE)
+        check_fields(self)
         require_flight_times(self)
         require_reset(self, self.filter_period_s)
-        require_probability(self, "switching")
-        require(
-            0 < self.misalignment_deg <= 90,
-            "misalignment_deg",
-            self.misalignment_deg,
-            "above 0 and at most 90",
-        )
         scored = self.scenario in ("large-misalignment", "all")
         require(
-            self.settle_s >= 0 and (not scored or self.settle_s < self.duration_s),
+            not scored or self.settle_s < self.duration_s,
             "settle_s",
             self.settle_s,
             f"between 0 and the flight time of {self.duration_s} s",
@@ -125,22 +123,20 @@ class MmaeUkfConfig:
             f"below {LONGEST_S:g} s, when the vehicle has no mass left",
         )
         # Beyond half a turn the sigma points would come round the other side.
-        reach = abs(self.alpha) * max(STATES + self.kappa, 0) ** 0.5 * self.misalignment_deg
+        reach = abs(self.alpha) * (STATES + self.kappa) ** 0.5 * self.misalignment_deg
         require(
             not scored or reach < 180 * 3**0.5,
             "misalignment_deg",
             self.misalignment_deg,
             "so small that the sigma points stay within half a turn",
         )
-        require(self.models >= 1, "models", self.models, "at least 1")
         require(
-            len(self.model_range) == 2 and self.model_range[0] < self.model_range[1],
+            self.model_range[0] < self.model_range[1],
             "model_range",
             self.model_range,
             "a lower and a higher factor",
         )
         require(self.alpha != 0, "alpha", self.alpha, "other than zero")
-        require(self.kappa > -STATES, "kappa", self.kappa, f"above -{STATES}")
 
     @property
     def steps(self) -> int:
@@ -177,23 +173,5 @@ class MmaeUkfConfig:
         return min(round(self.settle_s / self.filter_period_s), self.steps - 1)
 
 
-STATES = 15
-"""Tangent coordinates of the state."""
 LONGEST_S = 465.0
 """Flight time at which the default vehicle has burnt all of its mass [s]."""
-
-_POSITIVE = (
-    "duration_s",
-    "ins_rate_hz",
-    "filter_period_s",
-    "gyro_noise_deg_h",
-    "accel_noise_ug",
-    "accel_error_ug",
-    "accel_error_time_s",
-    "star_noise_arcsec",
-    "p0_attitude_arcsec",
-    "p0_velocity",
-    "p0_position",
-    "p0_drift_deg_h",
-    "model_range",
-)

@@ -6,9 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxnav.config import plain
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
 from jaxnav.studies.attitude import attitude_arrays, attitude_measures
-from jaxnav.studies.base import StudyResult, plain, run_scenarios
+from jaxnav.studies.base import StudyResult, run_scenarios
 from jaxnav.studies.mmae_ukf import cost, sweep
 from jaxnav.studies.mmae_ukf.claims import assess, discrepancies, gain
 from jaxnav.studies.mmae_ukf.config import SCENARIOS, MmaeUkfConfig

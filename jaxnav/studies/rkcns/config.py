@@ -2,16 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from jaxnav.studies.base import (
-    require,
-    require_choice,
-    require_finite,
-    require_flight_times,
-    require_positive,
-    require_runs,
-)
+from msgspec import Meta
+
+from jaxnav.config import Latitude, Positive, PositiveAxes, Runs, Seed, check_fields, require
+from jaxnav.studies.base import require_flight_times
 
 SCENARIOS = {
     "listed": "the sensors of Table 2, gyro random walk 0.5 deg/sqrt(h)",
@@ -71,36 +67,36 @@ class RkcnsConfig:
     """
 
     scenario: Literal["listed", "inferred", "strong-nonlinearity", "all"] = "listed"
-    runs: int = 100
-    seed: int = 0
-    duration_s: float = 600.0
-    start_s: float = 160.0
-    ins_rate_hz: float = 100.0
-    filter_period_s: float = 1.0
-    launch_period_s: float = 0.05
-    latitude_deg: float = 40.0
+    runs: Runs = 100
+    seed: Seed = 0
+    duration_s: Positive = 600.0
+    start_s: Positive = 160.0
+    ins_rate_hz: Positive = 100.0
+    filter_period_s: Positive = 1.0
+    launch_period_s: Positive = 0.05
+    latitude_deg: Latitude = 40.0
     sidereal_deg: float = 0.0
     azimuth_deg: float = 90.0
     year: float = 2025.0
     catalogue: Path | None = None
     magnitude_limit: float = 6.5
-    stars: int = 3
+    stars: Annotated[int, Meta(ge=0, le=20)] = 3
     tangent_km: tuple[float, float] = (20.0, 25.0)
-    random_walk_deg_sqrt_h: float | None = None
-    accel_noise_ug_sqrt_hz: float = 50.0
-    gyro_drift_deg_h: float = 1.0
-    accel_bias_ug: float = 100.0
-    star_noise_arcsec: float = 3.0
-    refraction_noise_arcsec: float | None = None
-    density_error: float = 0.0
+    random_walk_deg_sqrt_h: Positive | None = None
+    accel_noise_ug_sqrt_hz: Positive = 50.0
+    gyro_drift_deg_h: Positive = 1.0
+    accel_bias_ug: Positive = 100.0
+    star_noise_arcsec: Positive = 3.0
+    refraction_noise_arcsec: Positive | None = None
+    density_error: Annotated[float, Meta(ge=0, lt=0.2)] = 0.0
     atmosphere: Literal["fitted", "printed"] = "fitted"
-    p0_attitude_arcsec: tuple[float, float, float] = (10.0, 360.0, 10.0)
-    p0_velocity: float = 0.1
-    p0_position: float = 5.0
-    lost_km: float = 50.0
-    iterations: int = 3
-    trials: int = 6
-    point_spread: float | None = None
+    p0_attitude_arcsec: PositiveAxes = (10.0, 360.0, 10.0)
+    p0_velocity: Positive = 0.1
+    p0_position: Positive = 5.0
+    lost_km: Positive = 50.0
+    iterations: Annotated[int, Meta(ge=1, le=50)] = 3
+    trials: Annotated[int, Meta(ge=0, le=30)] = 6
+    point_spread: Positive | None = None
     ablations: bool = True
     cost: bool = True
 
@@ -110,13 +106,10 @@ class RkcnsConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "scenario", "atmosphere")
-        require_finite(self)
-        require_runs(self)
-        require_positive(self, *_POSITIVE)
+        check_fields(self)
         require_flight_times(self)
         self._require_phases()
-        low, high = self.tangent_km if len(self.tangent_km) == 2 else (1.0, 0.0)
+        low, high = self.tangent_km
         require(
             0 <= low < high <= TOP_KM,
             "tangent_km",
@@ -124,19 +117,6 @@ class RkcnsConfig:
             f"a lower and a higher height between the surface, 0, and the top of the atmosphere, "
             f"{TOP_KM:g} km",
         )
-        require(0 <= self.stars <= 20, "stars", self.stars, "between 0 and 20")
-        require(0 <= self.density_error < 0.2, "density_error", self.density_error, "in [0, 0.2)")
-        require(1 <= self.iterations <= 50, "iterations", self.iterations, "between 1 and 50")
-        require(0 <= self.trials <= 30, "trials", self.trials, "between 0 and 30")
-        require(
-            len(self.p0_attitude_arcsec) == 3,
-            "p0_attitude_arcsec",
-            self.p0_attitude_arcsec,
-            "three numbers",
-        )
-        for name in ("random_walk_deg_sqrt_h", "refraction_noise_arcsec", "point_spread"):
-            value = getattr(self, name)
-            require(value is None or 0 < value < float("inf"), name, value, "positive")
 
     def _require_phases(self) -> None:
         """Require that start, rates and periods divide the flight."""
@@ -210,19 +190,3 @@ FREE_FLIGHT_S = 131.0
 """Time of flight at which the default vehicle's thrust has decayed to zero [s]."""
 RETURN_S = 780.0
 """Time of flight until which the default vehicle is above 86 km [s]."""
-
-_POSITIVE = (
-    "duration_s",
-    "start_s",
-    "ins_rate_hz",
-    "filter_period_s",
-    "launch_period_s",
-    "accel_noise_ug_sqrt_hz",
-    "gyro_drift_deg_h",
-    "accel_bias_ug",
-    "star_noise_arcsec",
-    "p0_attitude_arcsec",
-    "p0_velocity",
-    "p0_position",
-    "lost_km",
-)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.compiling import compiled, host
+from jaxnav.config import require
 from jaxnav.datasets.stars import load_stars
 from jaxnav.estimation.filters.kalman import ekf
 from jaxnav.estimation.run import run
@@ -26,7 +27,6 @@ from jaxnav.navigation.states import LAYOUT, SinsTotal, retract_total
 from jaxnav.navigation.strapdown.increments import accumulate
 from jaxnav.navigation.trajectory.base import Trajectory
 from jaxnav.navigation.trajectory.rocket import RocketProfile, fly
-from jaxnav.studies.base import require
 from jaxnav.studies.rkcns.config import RkcnsConfig
 from jaxnav.units import ARCSEC, DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, MICRO_G
 

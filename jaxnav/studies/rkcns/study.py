@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxnav.config import plain
 from jaxnav.estimation.metrics import chi2_mean_bounds, rmse
 from jaxnav.estimation.montecarlo import Campaign
 from jaxnav.navigation.states import STATES
 from jaxnav.studies.attitude import AXES, DIVERGED_SIGMAS
-from jaxnav.studies.base import StudyResult, check_simulated, plain, run_scenarios
+from jaxnav.studies.base import StudyResult, check_simulated, run_scenarios
 from jaxnav.studies.rkcns import cost
 from jaxnav.studies.rkcns.ablations import (
     Outcome,

@@ -2,17 +2,23 @@
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal
+from typing import Annotated, Literal
 
-from jaxnav.studies.base import (
+from msgspec import Meta
+
+from jaxnav.config import (
+    NotNegative,
+    Positive,
+    PositiveAxes,
+    Positives,
+    Probability,
+    Runs,
+    Seed,
+    check_fields,
     require,
-    require_choice,
-    require_finite,
-    require_positive,
-    require_probability,
-    require_runs,
-    require_weight_floor,
+    require_different,
 )
+from jaxnav.studies.base import require_weight_floor
 
 SCENARIOS = {
     "tuned": "noisy accelerometers, and filters that know their noise",
@@ -65,37 +71,37 @@ class SageHusaConfig:
     """
 
     scenario: Literal["tuned", "mistuned", "all"] = "tuned"
-    runs: int = 100
-    seed: int = 0
-    duration_s: float = 3500.0
-    ins_rate_hz: float = 20.0
-    fix_interval_s: float = 1.0
-    arw_deg_sqrt_h: float = 0.2
-    vrw: float | None = None
-    vrw_believed: float = 0.05
-    gyro_drift_deg_h: float = 0.5
-    accel_bias_mg: float = 10.0
-    gnss_velocity: float = 0.5
-    gnss_position: float = 3.0
+    runs: Runs = 100
+    seed: Seed = 0
+    duration_s: Positive = 3500.0
+    ins_rate_hz: Positive = 20.0
+    fix_interval_s: Positive = 1.0
+    arw_deg_sqrt_h: Positive = 0.2
+    vrw: Positive | None = None
+    vrw_believed: Positive = 0.05
+    gyro_drift_deg_h: Positive = 0.5
+    accel_bias_mg: Positive = 10.0
+    gnss_velocity: Positive = 0.5
+    gnss_position: Positive = 3.0
     first_noise_s: tuple[float, float] = (700.0, 1200.0)
     second_noise_s: tuple[float, float] = (1800.0, 2300.0)
-    first_noise: float = 6.0
-    second_noise: float = 9.0
-    p0_attitude_deg: tuple[float, float, float] = (0.5, 0.5, 1.0)
-    p0_velocity: float = 0.5
-    p0_position: float = 3.0
-    forgetting: tuple[float, ...] = (0.95, 0.97, 0.99)
-    single_forgetting: float = 0.97
-    q_scales: tuple[float, ...] = (0.1, 1.0, 10.0)
-    r_scales: tuple[float, ...] = (0.5, 1.0, 3.0, 5.0, 10.0)
-    prior_count: float = 10.0
-    clamp: tuple[float, float] = (0.1, 100.0)
-    penalty_scale: float = 0.5
-    penalty_exponent: float = 0.15
-    decay_steps: float = 1000.0
-    decay_least: float = 0.05
-    weight_floor: float = 1e-3
-    start_r: float = 10.0
+    first_noise: Positive = 6.0
+    second_noise: Positive = 9.0
+    p0_attitude_deg: PositiveAxes = (0.5, 0.5, 1.0)
+    p0_velocity: Positive = 0.5
+    p0_position: Positive = 3.0
+    forgetting: Annotated[tuple[Probability, ...], Meta(min_length=1)] = (0.95, 0.97, 0.99)
+    single_forgetting: Probability = 0.97
+    q_scales: Positives = (0.1, 1.0, 10.0)
+    r_scales: Positives = (0.5, 1.0, 3.0, 5.0, 10.0)
+    prior_count: NotNegative = 10.0
+    clamp: tuple[Positive, Positive] = (0.1, 100.0)
+    penalty_scale: NotNegative = 0.5
+    penalty_exponent: NotNegative = 0.15
+    decay_steps: Positive = 1000.0
+    decay_least: NotNegative = 0.05
+    weight_floor: Positive = 1e-3
+    start_r: Positive = 10.0
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing.
@@ -103,21 +109,12 @@ class SageHusaConfig:
         Raises:
             ConfigError: With one sentence naming the field, its value and what is accepted.
         """
-        require_choice(self, "scenario")
-        require_finite(self)
-        require_runs(self)
-        require_positive(self, *_POSITIVE)
-        require(self.vrw is None or self.vrw > 0, "vrw", self.vrw, "positive")
-        require_probability(self, "single_forgetting")
+        check_fields(self)
         self._require_times()
-        for name in ("forgetting", "q_scales", "r_scales"):
-            value = getattr(self, name)
-            require(len(set(value)) == len(value), name, value, "different numbers")
+        require_different(self, "forgetting", "q_scales", "r_scales")
         for name in ("q_scales", "r_scales"):
             value = getattr(self, name)
             require(1.0 in value, name, value, "such that one of them is 1")
-        inside = all(0 < b < 1 for b in self.forgetting)
-        require(inside, "forgetting", self.forgetting, "between 0 and 1")
         require(
             self.single_forgetting in self.forgetting,
             "single_forgetting",
@@ -126,12 +123,6 @@ class SageHusaConfig:
         )
         low, high = self.clamp
         require(low < 1 < high, "clamp", self.clamp, "a number below 1 and one above")
-        require(self.prior_count >= 0, "prior_count", self.prior_count, "zero or more")
-        for name in ("penalty_scale", "penalty_exponent", "decay_least"):
-            require(getattr(self, name) >= 0, name, getattr(self, name), "zero or more")
-        require(
-            len(self.p0_attitude_deg) == 3, "p0_attitude_deg", self.p0_attitude_deg, "three numbers"
-        )
         require_weight_floor(self, len(self.grid))
 
     def _require_times(self) -> None:
@@ -183,26 +174,3 @@ VRW = {"tuned": 0.05, "mistuned": 0.01, "all": 0.05}
 """True velocity random walk of the scenarios [m/s/sqrt(s)]."""
 WINDOWS_S = ((0.0, 100.0), (200.0, 300.0), (400.0, 500.0))
 """Intervals of Experiment 1 [s]."""
-_POSITIVE = (
-    "duration_s",
-    "ins_rate_hz",
-    "fix_interval_s",
-    "arw_deg_sqrt_h",
-    "vrw_believed",
-    "gyro_drift_deg_h",
-    "accel_bias_mg",
-    "gnss_velocity",
-    "gnss_position",
-    "first_noise",
-    "second_noise",
-    "p0_attitude_deg",
-    "p0_velocity",
-    "p0_position",
-    "forgetting",
-    "q_scales",
-    "r_scales",
-    "clamp",
-    "decay_steps",
-    "weight_floor",
-    "start_r",
-)

@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxnav.config import plain
 from jaxnav.estimation.montecarlo import Campaign, monte_carlo
-from jaxnav.studies.base import StudyResult, plain, run_scenarios
+from jaxnav.studies.base import StudyResult, run_scenarios
 from jaxnav.studies.sage_husa.claims import TABLE_4, assess, best_single, change, span_name
 from jaxnav.studies.sage_husa.config import SCENARIOS, WINDOWS_S, SageHusaConfig
 from jaxnav.studies.sage_husa.methods import (
