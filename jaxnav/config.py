@@ -7,6 +7,7 @@ concerns several fields at once follows with :func:`require`. No JAX is needed f
 
 import difflib
 import math
+import sys
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import fields
@@ -78,13 +79,17 @@ def check_fields(config: Any) -> None:
     """Hold every field of a configuration against its annotation, and make it of that type.
 
     A list becomes a tuple, a whole number in the place of another one a float, a text a path; what
-    is a number is to be finite.
+    is a number is to be finite. What JAX traces stays as it is, so that a program may differentiate
+    by a field.
 
     Raises:
         FieldError: With one sentence naming the field, its value and what is accepted.
     """
     for name, (kind, bounded) in annotations(type(config)).items():
-        value = converted(name, kind, getattr(config, name))
+        value = getattr(config, name)
+        if _is_traced(value):
+            continue
+        value = converted(name, kind, value)
         if _fits(value, bounded):
             entries = value if isinstance(value, tuple) else (value,)
             finite = all(math.isfinite(entry) for entry in entries if isinstance(entry, float))
@@ -241,6 +246,12 @@ def _native(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_native(entry) for entry in value]
     return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _is_traced(value: Any) -> bool:
+    core = sys.modules.get("jax.core")
+    entries = value if isinstance(value, tuple | list) else (value,)
+    return core is not None and any(isinstance(entry, core.Tracer) for entry in entries)
 
 
 def _path(kind: type, value: Any) -> Any:

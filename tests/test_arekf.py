@@ -29,7 +29,7 @@ from jaxnav.studies.arekf.study import run_campaign, run_study
         ({"gnss_velocity": float("nan")}, "gnss_velocity is nan"),
         ({"outlier_share": 0.7}, r"outlier_share is 0.7; it must be in \[0, 0.5\)"),
         ({"p0_attitude_deg": (1.0, 1.0)}, "it must be three numbers"),
-        ({"heading_deg": 120.0}, "heading_deg is 120.0; it must be at most 90"),
+        ({"heading_deg": 120.0}, r"heading_deg is 120.0; it must be in \(0, 90\]"),
         ({"settle_s": 120.0}, "settle_s is 120.0"),
         ({"versoria_width": -0.1}, "versoria_width is -0.1"),
         ({"iae_memory": 0.5}, "iae_memory is 0.5"),

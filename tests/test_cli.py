@@ -59,15 +59,15 @@ BAD = {
     ),
     "threshold above one": (
         ("run", "immae", "--reset-threshold", "1.5"),
-        ("reset_threshold is 1.5", "(0, 1]"),
+        ("--reset-threshold is 1.5", "(0, 1]"),
     ),
     "threshold of zero": (
         ("run", "immae", "--reset-threshold", "0"),
-        ("reset_threshold is 0.0", "(0, 1]"),
+        ("--reset-threshold is 0.0", "(0, 1]"),
     ),
     "drift that is no number": (
         ("run", "immae", "--gyro-drift-deg-h", "nan"),
-        ("gyro_drift_deg_h is nan", "finite"),
+        ("--gyro-drift-deg-h is nan", "finite"),
     ),
     "densities that repeat": (
         ("run", "gnss-track", "--q", "1", "1"),
@@ -75,11 +75,11 @@ BAD = {
     ),
     "period below a step": (
         ("run", "immae", "--reset-period-s", "0.01"),
-        ("reset_period_s is 0.01", "at least one filter period of 0.05 s"),
+        ("--reset-period-s is 0.01", "at least one filter period of 0.05 s"),
     ),
     "period that is no multiple": (
         ("run", "immae", "--filter-period-s", "0.055"),
-        ("filter_period_s is 0.055", "whole number of inertial samples"),
+        ("--filter-period-s is 0.055", "whole number of inertial samples"),
     ),
     "log that is missing": (
         ("run", "gnss-track", "--log", "/nowhere/at.pos"),

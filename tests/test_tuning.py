@@ -97,8 +97,8 @@ def test_what_is_not_tuned_stays(tmp_path: Path) -> None:
         (("--start", "q=1,2,x,4"), "'x' in 'q=1,2,x,4' is no number"),
         (("--start", "switching"), "start is 'switching'; it must be given as NAME=VALUE"),
         (("--steps", "0"), "steps is 0; it must be at least 1"),
-        (("--profile-points", "4"), "profile_points is 4; it must be 0, or odd and at least 3"),
-        (("--held-out-runs", "1"), "held_out_runs is 1; it must be at least 2"),
+        (("--profile-points", "4"), "--profile-points is 4; it must be 0, or odd and at least 3"),
+        (("--held-out-runs", "1"), "--held-out-runs is 1; it must be at least 2"),
     ],
 )
 def test_bad_input_is_one_sentence(
@@ -188,5 +188,5 @@ def test_starts_and_bounds_are_read() -> None:
     assert parse_bounds(("a=-1:2",)) == {"a": (-1.0, 2.0)}
     with pytest.raises(ConfigError, match="a is inf; it must be finite"):
         parse_start(("a=inf",))
-    with pytest.raises(ConfigError, match="rate is 0; it must be positive"):
+    with pytest.raises(ConfigError, match=r"rate is 0\.0; it must be positive"):
         TuneConfig(rate=0)
