@@ -271,7 +271,7 @@ def _filter(rest: list[str]) -> int:
     directory = claim_directory(parsed.out)
     with Progress(quiet=parsed.json, unit="parts") as progress:
         report = analyse(log, parsed.config, progress)
-    write_trajectory(report.drive, report.kept, report.members, log.source, directory)
+    write_trajectory(report.drive, report.trajectory, report.members, log.source, directory)
     figures = draw(report, log, directory)
     write_document(report.document, directory / "summary.json")
     if parsed.json:

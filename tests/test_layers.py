@@ -184,6 +184,7 @@ ORDER = (
     "recorded.start",
     "recorded.preparation",
     "recorded.methods",
+    "recorded.points",
     "recorded.scoring",
     "recorded.experiments",
     "recorded.turning",

@@ -26,6 +26,7 @@ from jaxnav.recorded.experiments import (
 from jaxnav.recorded.methods import Kept, Method, filter_params, member_names, method
 from jaxnav.recorded.motion import since_start
 from jaxnav.recorded.offset import Offset, likeliest_offset
+from jaxnav.recorded.points import at_point
 from jaxnav.recorded.preparation import Drive, prepare
 from jaxnav.recorded.scoring import (
     ReferenceErrors,
@@ -53,6 +54,7 @@ class Report(NamedTuple):
         document: Contents of ``summary.json``.
         drive: The prepared drive.
         kept: The run.
+        trajectory: The same with velocity and position of the point that was asked for.
         members: Names of the members of a bank.
         reference: Errors against the reference, if there is one.
         outages: Errors without fixes, if they were hidden.
@@ -62,6 +64,7 @@ class Report(NamedTuple):
     document: dict[str, Any]
     drive: Drive
     kept: Kept
+    trajectory: Kept
     members: list[str]
     reference: ReferenceErrors | None
     outages: Outages | None
@@ -137,7 +140,8 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         "notes": notes + _notes(log, drive, config),
         "provenance": provenance(),
     }
-    return Report(document, drive, kept, names, reference, outages, noise)
+    trajectory = at_point(kept, log, drive, config)
+    return Report(document, drive, kept, trajectory, names, reference, outages, noise)
 
 
 def _wants_outages(log: DriveLog, config: FilterConfig) -> bool:

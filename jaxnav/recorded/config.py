@@ -83,6 +83,8 @@ class FilterConfig:
         gate: Whether fixes that contradict the filter are refused, and named.
         gate_false_alarm: Probability to refuse a position or a velocity though the filter is right.
         gate_patience: Refusals in a row over which the gate opens by e, in squares.
+        point: Which point the trajectory that is written is of: the inertial sensors, the antenna
+            (where the filter finds it, if its lever arm is carried) or the rear axle.
         strict: Whether a fault that the audit finds makes the exit code 4.
         align_speed: Speed at which the course gives the heading, and the filter starts [m/s].
         outages: Whether to hide the fixes in windows and score against them; auto does if most
@@ -129,6 +131,7 @@ class FilterConfig:
     gate: bool = True
     gate_false_alarm: Probability = 1e-9
     gate_patience: Positive = 5.0
+    point: Literal["sensors", "antenna", "axle"] = "sensors"
     strict: bool = False
     align_speed: Positive = 3.0
     outages: When = "auto"

@@ -76,6 +76,8 @@ class Kept(NamedTuple):
         sigma: ``(15,)`` standard deviations in additive errors.
         carried: States that are carried besides, by name.
         carried_sigma: ``(k,)`` their standard deviations.
+        cov: ``(15 + k, 15 + k)`` covariance in additive errors where the run is written at another
+            point than the sensors; ``(0, 0)`` elsewhere.
         nis: Normalised innovation squared.
         parts: By channel of the model, what the update told of it.
         flags: Sum of :class:`~jaxnav.estimation.types.Flag`.
@@ -87,6 +89,7 @@ class Kept(NamedTuple):
     sigma: Array
     carried: dict[str, Array]
     carried_sigma: Array
+    cov: Array
     nis: Array
     parts: dict[str, ChannelInfo]
     flags: Array
@@ -110,7 +113,16 @@ def method(config: FilterConfig, origin: Array, *, constrained: bool = True) -> 
     error: LevelError = ERRORS.get(config.filter, "additive")
     about = tuple(np.asarray(origin).tolist()) if error == "right-invariant" else (0.0, 0.0, 0.0)
     weighed = config.rule if members(config) > 1 else None
-    return _method(config.filter, weighed, config.gate, error, about, constrained, config.carry)
+    return _method(
+        config.filter,
+        weighed,
+        config.gate,
+        error,
+        about,
+        constrained,
+        config.carry,
+        config.point != "sensors",
+    )
 
 
 @cache
@@ -122,6 +134,7 @@ def _method(
     about: tuple[float, ...],
     constrained: bool,
     carry: tuple[str, ...],
+    whole: bool,
 ) -> Method:
     """Return a method; another call finds it and with it the programs compiled for it."""
     origin = jnp.array(about)
@@ -135,8 +148,8 @@ def _method(
         estimate = chosen.estimate(state)
         banked = state.inner if gate else state
         weights = jnp.zeros(0) if weighed is None else jnp.exp(banked.log_weights)
-        whole = estimate.mean
-        mean, besides = (whole.own, whole.carried) if carry else (whole, {})
+        point = estimate.mean
+        mean, besides = (point.own, point.carried) if carry else (point, {})
         own = Gaussian(mean, estimate.cov[:STATES, :STATES])
         left = jnp.diag(estimate.cov)[STATES:]
         return Kept(
@@ -144,6 +157,7 @@ def _method(
             additive_sigma(form, own),
             besides,
             jnp.sqrt(jnp.maximum(left, 0)),
+            additive_cov(form, mean, estimate.cov) if whole else jnp.zeros((0, 0)),
             info.nis,
             {name: model.part(info, name) for name, _ in model.channels},
             info.flags,
@@ -323,6 +337,15 @@ def columns(push: Callable[[Any, Array], Array], x: SinsLevel, cov: Array) -> Ar
     """Return a covariance in other coordinates, taken there by their derivative ``push(x, d)``."""
     pushed = jax.vmap(lambda d: push(x, d), in_axes=1, out_axes=1)
     return pushed(pushed(cov).T)
+
+
+def additive_cov(form: ErrorForm, x: SinsLevel, cov: Array) -> Array:
+    """Return a covariance ``(15 + k, 15 + k)`` in additive errors; what is carried adds anyhow."""
+
+    def push(x: SinsLevel, d: Array) -> Array:
+        return jnp.concatenate([form.to_additive(x, d[:STATES]), d[STATES:]])
+
+    return columns(push, x, cov)
 
 
 def additive_sigma(form: ErrorForm, estimate: Gaussian) -> Array:

@@ -50,7 +50,8 @@ _KML = """<?xml version="1.0" encoding="UTF-8"?>
 def write_csv(drive: Drive, kept: Kept, path: Path) -> Path:
     """Write the trajectory with its standard deviations as CSV; roll and pitch of C_nb.
 
-    The time counts from the first inertial sample; the position is that of the inertial sensors.
+    The time counts from the first inertial sample; position and velocity are those of the point
+    that the run is of (:func:`~jaxnav.recorded.points.at_point`).
     """
     position, sigma = np.asarray(kept.mean.position), np.asarray(kept.sigma)
     degrees = attitude_angles(np.asarray(kept.mean.dcm)) / DEG
