@@ -21,8 +21,8 @@ def print_doctor() -> None:
     table.add_row("cores", str(cores()))
     accepted = accepted_options()
     for name, value in OPTIONS.items():
-        told = str(value) if name in accepted else "not known to this jaxlib, left out"
-        table.add_row(f"compiler option {name}", told)
+        shown = str(value) if name in accepted else "not known to this jaxlib, left out"
+        table.add_row(f"compiler option {name}", shown)
     kept = jax.config.values["jax_compilation_cache_dir"]
     if kept and jax.config.values["jax_enable_compilation_cache"]:
         count, size = program_cache.size(Path(kept))

@@ -43,10 +43,10 @@ def _processor() -> str:
     """Return a short name for the instructions that a program compiled here may use."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        told = next(line for line in lines if line.lower().startswith(("flags", "features")))
+        features = next(line for line in lines if line.lower().startswith(("flags", "features")))
     except (OSError, StopIteration):
-        told = platform.processor()
-    return hashlib.sha256(told.encode()).hexdigest()[:8]
+        features = platform.processor()
+    return hashlib.sha256(features.encode()).hexdigest()[:8]
 
 
 def prepared() -> Path | None:

@@ -23,7 +23,7 @@ SAMPLES = 20_000
 def moving(x: SinsLevel, arm: jax.Array) -> tuple[jax.Array, jax.Array]:
     """True velocity and position of a point, by differences of where it is."""
     offset = x.dcm @ arm
-    swung = jnp.gradient(offset, 1 / RATE, axis=0)
+    swung = jnp.asarray(jnp.gradient(offset, 1 / RATE, axis=0))
     return x.velocity + swung, jax.vmap(displaced)(x.position, offset)
 
 

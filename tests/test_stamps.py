@@ -16,7 +16,7 @@ def between(stamps: np.ndarray) -> tuple[float, int, int, bool]:
     found = steps_between(np.diff(np.rint(np.sort(stamps) * STEP).astype(np.int64)))
     assert found.between.min() >= 1
     gaps, missing = int(np.sum(found.between > 1)), int(np.sum(found.between - 1))
-    return found.step / STEP, gaps, missing, found.told
+    return found.step / STEP, gaps, missing, found.certain
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1 / 3, 0.5, 0.6])

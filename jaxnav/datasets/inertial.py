@@ -161,8 +161,8 @@ def on_grid(log: ImuLog) -> ImuLog:
             told from jitter.
     """
     intervals = np.diff(log.time_ns)
-    steps, _, told = steps_between(intervals)
-    if not told:
+    steps, _, certain = steps_between(intervals)
+    if not certain:
         raise DataError(
             f"{log.source}: many samples are missing and the stamps of the others scatter by a "
             "large part of the sampling interval, so gaps are not told from jitter; accepted are "

@@ -110,14 +110,14 @@ def _check_way(
     time, place, velocity = (time_ns[known] - time_ns[0]) / 1e9, geodetic[known], velocity[known]
     way = _travelled(time, velocity)
     begin, end = _stretches(time)
-    told = way[end] - way[begin]
+    travelled = way[end] - way[begin]
     turn = np.remainder(place[end] - place[begin] + np.pi, 2 * np.pi) - np.pi
     moved = MEAN_RADIUS * np.stack([turn[:, 1] * np.cos(place[begin, 0]), turn[:, 0]], axis=1)
-    lengths = np.stack([np.linalg.norm(told, axis=1), np.linalg.norm(moved, axis=1)])
+    lengths = np.stack([np.linalg.norm(travelled, axis=1), np.linalg.norm(moved, axis=1)])
     far = lengths.max(axis=0) > least
     if not far.any():
         return
-    if np.median((np.sum(told * moved, axis=1) / lengths.max(axis=0) ** 2)[far]) < 0.5:
+    if np.median((np.sum(travelled * moved, axis=1) / lengths.max(axis=0) ** 2)[far]) < 0.5:
         told_m, moved_m = np.median(lengths[:, far], axis=1)
         raise DataError(
             f"in ten seconds the positions move by {moved_m:.4g} m and the velocities by "
@@ -135,11 +135,11 @@ def _check_climb(
     time, height = (time_ns[known] - time_ns[0]) / 1e9, height[known]
     way = _travelled(time, climb[known, None])[:, 0]
     begin, end = _stretches(time)
-    told, moved = way[end] - way[begin], height[end] - height[begin]
-    far = np.abs(told) > least
+    climbed, moved = way[end] - way[begin], height[end] - height[begin]
+    far = np.abs(climbed) > least
     if far.sum() < _MANY_STRETCHES:
         return
-    ratio = float(np.median(moved[far] / told[far]))
+    ratio = float(np.median(moved[far] / climbed[far]))
     if not 0.5 < ratio < 2:
         raise DataError(
             f"the heights change {ratio:.3g} times as fast as the vertical velocities say; "

@@ -29,12 +29,12 @@ class Steps(NamedTuple):
         between: ``(N - 1,)``, one or more; one where nothing is missing.
         step: Sampling interval, the mean of those that are one: stamps in whole milliseconds have a
             median interval that is wrong by percents.
-        told: Whether gaps could be told from jitter.
+        certain: Whether gaps could be told from jitter.
     """
 
     between: NDArray[np.int64]
     step: float
-    told: bool = True
+    certain: bool = True
 
 
 def steps_between(intervals: NDArray[np.int64]) -> Steps:
@@ -68,8 +68,8 @@ def steps_between(intervals: NDArray[np.int64]) -> Steps:
     whole = float(np.median(late[_WINDOW:] - late[:-_WINDOW])) / _WINDOW
     # the jitter of a stamp makes one interval longer and the next shorter, a loss makes one longer
     moved = intervals[intervals < _SURE * whole] - whole
-    told = float(moved[1:] @ moved[:-1]) < _PAIRED * float(moved @ moved)
-    return Steps(_averaged(intervals, whole), whole, told)
+    certain = float(moved[1:] @ moved[:-1]) < _PAIRED * float(moved @ moved)
+    return Steps(_averaged(intervals, whole), whole, certain)
 
 
 def _shortest(intervals: NDArray[np.int64]) -> float:

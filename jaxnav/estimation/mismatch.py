@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.innovation import heard_by, innovation_info, mask_noise
+from jaxnav.estimation.filters.innovation import innovation_info, mask_noise, measurement_of
 from jaxnav.estimation.filters.linearise import jacobians
 from jaxnav.estimation.types import (
     Filter,
@@ -84,11 +84,11 @@ def mismatched(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> F
     ) -> tuple[MismatchState, Info]:
         n = state.actual.shape[0]
         _, H = jacobians(model, params.actual.model, state.x, u, n)
-        told = heard_by(model, params.believed.model, state.x, u, obs)
-        valid = told.obs.valid
+        measurement = measurement_of(model, params.believed.model, state.x, u, obs)
+        valid = measurement.obs.valid
         H = jnp.where(valid[:, None], H, 0)
         noise = mask_noise(model.observation_noise(params.actual.model, state.x, u), valid)
-        S = symmetrise(H @ state.believed @ H.T) + told.noise
+        S = symmetrise(H @ state.believed @ H.T) + measurement.noise
         root = cholesky(S)
         K = solve_lower_transposed(root.factor, solve_lower(root.factor, H @ state.believed)).T
         K = jnp.where(valid[None] & root.positive_definite, K, 0)
@@ -99,10 +99,10 @@ def mismatched(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> F
 
         moved = MismatchState(
             state.x,
-            corrected(state.believed, told.noise),
+            corrected(state.believed, measurement.noise),
             corrected(state.actual, noise),
         )
-        return moved, innovation_info(jnp.zeros_like(S[0]), S, root, told, jnp.array(False))
+        return moved, innovation_info(jnp.zeros_like(S[0]), S, root, measurement, jnp.array(False))
 
     def estimate(state: MismatchState) -> Gaussian:
         return Gaussian(state.x, state.actual)

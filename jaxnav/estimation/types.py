@@ -235,18 +235,18 @@ class Model(NamedTuple):
         have = ", ".join(names) or "not named"
         raise ValueError(f"the model has no channel {name!r}; its channels are {have}{hint}")
 
-    def width(self, told: int | None = None) -> int:
-        """Return the number of values of an observation; told, where channels have no names.
+    def width(self, channels: int | None = None) -> int:
+        """Return the number of values of an observation; ``channels`` where they have no names.
 
         Raises:
-            ValueError: If it is neither told nor known, or what is told is not what is known.
+            ValueError: If it is neither given nor known, or what is given is not what is known.
         """
         known = sum(size for _, size in self.channels) or None
-        if told is None and known is None:
+        if channels is None and known is None:
             raise ValueError("the model's channels have no names; give their number, channels=m")
-        if told is not None and known is not None and told != known:
-            raise ValueError(f"channels is {told}; those of the model have {known} values")
-        return known or told or 0
+        if channels is not None and known is not None and channels != known:
+            raise ValueError(f"channels is {channels}; those of the model have {known} values")
+        return known or channels or 0
 
     def stack(self, values: Mapping[str, Any], valid: Mapping[str, Any] | None = None) -> Obs:
         """Return the observations of some channels by name; the others are missing.

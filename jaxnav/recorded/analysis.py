@@ -14,7 +14,7 @@ from jaxnav.estimation.types import Flag
 from jaxnav.findings import document_of, faults
 from jaxnav.navigation.models.vehicle import CONSTRAINTS, FIXES
 from jaxnav.recorded.audit import audit
-from jaxnav.recorded.carry import told
+from jaxnav.recorded.carry import summary
 from jaxnav.recorded.config import FilterConfig, check, members
 from jaxnav.recorded.experiments import (
     NoiseScores,
@@ -125,7 +125,7 @@ def analyse(log: DriveLog, config: FilterConfig, progress: Progress | None = Non
         "members": names,
         "filter": _filter_scores(drive, kept, off),
         "channels": _channel_scores(drive, kept),
-        "carried": told(
+        "carried": summary(
             config.carry,
             {name: np.asarray(values)[-1] for name, values in kept.carried.items()},
             np.asarray(kept.carried_sigma)[-1],

@@ -180,7 +180,7 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
     if moving.sum() < LEAST_TRACK or surge[moving].std() < 0.2:
         return [Finding("forward axis", "not seen", math.nan, (0.0, 0.0), "")]
     along, across = (matched(surge[moving], gain[moving])[0] for gain in gains)
-    told = (
+    changes = (
         "points backward"
         if along < -0.3 and abs(along) > abs(across)
         else "is not forward: y moves with it"
@@ -194,7 +194,7 @@ def _driving(log: DriveLog, drive: Drive) -> list[Finding]:
             (0.3, 1.0),
             (0.0, 1.0),
             "",
-            f"when the speed grows the x accelerometer {told} (correlation {along:.2f}, y "
+            f"when the speed grows the x accelerometer {changes} (correlation {along:.2f}, y "
             f"{across:.2f}): check the axes; they must be forward, left, up",
         )
     ]

@@ -80,7 +80,7 @@ def carried(params: FilterParams, names: Sequence[str]) -> FilterParams:
     )
 
 
-def told(names: Sequence[str], values: dict[str, Array], sigma: Array) -> dict[str, Any]:
+def summary(names: Sequence[str], values: dict[str, Array], sigma: Array) -> dict[str, Any]:
     """Return what was found of the states at the end, by name, in the unit of each.
 
     Args:

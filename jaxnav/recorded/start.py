@@ -110,13 +110,13 @@ def _direction(
         return 1.0
     force = np.where(log.imu.valid, log.imu.accel[:, 0], 0.0)
     gained = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(time))])
-    told = np.diff(np.interp(fix_time[near], time, gained))
+    turned = np.diff(np.interp(fix_time[near], time, gained))
     seen, spans = np.diff(speed[near]), np.diff(fix_time[near])
     # A tilt and a bias push evenly.
-    told = told - spans * np.sum(told) / np.sum(spans)
+    turned = turned - spans * np.sum(turned) / np.sum(spans)
     seen = seen - spans * np.sum(seen) / np.sum(spans)
-    size = np.linalg.norm(told) * np.linalg.norm(seen)
-    return -1.0 if size > 0 and float(told @ seen) < -0.5 * size else 1.0
+    size = np.linalg.norm(turned) * np.linalg.norm(seen)
+    return -1.0 if size > 0 and float(turned @ seen) < -0.5 * size else 1.0
 
 
 def _last_rest(still: np.ndarray, shortest: int) -> slice | None:

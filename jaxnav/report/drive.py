@@ -27,14 +27,14 @@ def print_filter(document: dict[str, Any], directory: Path, figures: list[Path])
         soft_wrap=True,
     )
     within = run["nis_within"]
-    told = ", ".join(
+    judged = ", ".join(
         f"{finding['name'].removeprefix('NIS, ')} {finding['verdict']}"
         for finding in document["audit"]
         if finding["name"].startswith("NIS, ") and finding["verdict"] != "not seen"
     )
     console.print(
         f"log-likelihood {run['log_likelihood']:.1f}; NIS per channel "
-        f"{run['nis_per_channel']:.3g} ({told or 'not judged'}), {within['share']:.1%} of fixes "
+        f"{run['nis_per_channel']:.3g} ({judged or 'not judged'}), {within['share']:.1%} of fixes "
         f"within the {within['confidence']:.0%} bound",
         soft_wrap=True,
     )

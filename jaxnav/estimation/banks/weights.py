@@ -137,8 +137,8 @@ def penalty() -> WeightRule:
         usable = jnp.isfinite(info.log_likelihood)
         normaliser = jnp.where(usable, info.log_likelihood, 0) + 0.5 * info.nis
         evidence = params.normaliser * normaliser - (params.least + grown) * info.nis
-        told = info._replace(log_likelihood=jnp.where(usable, evidence, -jnp.inf))
-        return count, bayes_step(log_weights, told)
+        judged = info._replace(log_likelihood=jnp.where(usable, evidence, -jnp.inf))
+        return count, bayes_step(log_weights, judged)
 
     return WeightRule(init, stay, update, _check_penalty)
 

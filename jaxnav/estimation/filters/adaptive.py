@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.checks import POSITIVE, require_ordered
-from jaxnav.estimation.filters.innovation import heard_by
+from jaxnav.estimation.filters.innovation import measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
     given,
@@ -125,10 +125,14 @@ def innovation_adaptive(
         params: FilterParams, state: AdaptiveState, u: Input, obs: Obs
     ) -> tuple[AdaptiveState, Info]:
         own, params = parted(params, Adaptation())
-        told = heard_by(own_model, params.model, base.estimate(state.inner).mean, u, obs)
-        inner, info = base.update(given(params, 1.0, told.noise), state.inner, u, told.obs)
-        moved = moved_log_factor(own, state.log_factor, info, told.obs, smooth=smooth)
-        return AdaptiveState(inner, moved), told.upon(info)
+        measurement = measurement_of(
+            own_model, params.model, base.estimate(state.inner).mean, u, obs
+        )
+        inner, info = base.update(
+            given(params, 1.0, measurement.noise), state.inner, u, measurement.obs
+        )
+        moved = moved_log_factor(own, state.log_factor, info, measurement.obs, smooth=smooth)
+        return AdaptiveState(inner, moved), measurement.upon(info)
 
     def estimate(state: AdaptiveState) -> Gaussian:
         return base.estimate(state.inner)
@@ -156,18 +160,18 @@ def moved_log_factor(
         smooth: Whether the bounds are smooth.
     """
     S = jnp.diag(info.innovation_cov)
-    told = obs.valid & (S > 0)
-    ratio = info.innovation**2 / jnp.where(told, S, 1)
+    used = obs.valid & (S > 0)
+    ratio = info.innovation**2 / jnp.where(used, S, 1)
     bounded = jnp.minimum(ratio, LARGEST_RATIO)
     if smooth:
         room = (LARGEST_RATIO - ratio) / own.temperature
         bounded = LARGEST_RATIO - own.temperature * jax.nn.softplus(room)
-    excess = jnp.where(told, bounded - MEAN_RATIO, 0)
-    channels = jnp.maximum(jnp.sum(told), 1).astype(S.dtype)
+    excess = jnp.where(used, bounded - MEAN_RATIO, 0)
+    channels = jnp.maximum(jnp.sum(used), 1).astype(S.dtype)
     step = jnp.sum(excess) / channels / own.memory
     low, high = jnp.log(own.low), jnp.log(own.high)
     if smooth:
         soft = softly_clamped(log_factor + step, low, high, own.temperature)
         # Applied without data too, the smooth clamp would move the factor step by step.
-        return jnp.where(jnp.any(told), soft, log_factor).astype(S.dtype)
+        return jnp.where(jnp.any(used), soft, log_factor).astype(S.dtype)
     return jnp.clip(log_factor + step, low, high).astype(S.dtype)

@@ -21,7 +21,7 @@ ILL_CONDITIONED_EPS = 1e3
 """Multiple of the machine epsilon below which a Cholesky pivot is called ill-conditioned."""
 
 
-class Heard(NamedTuple):
+class Measurement(NamedTuple):
     """What an update takes of an observation.
 
     Attributes:
@@ -42,7 +42,7 @@ class Heard(NamedTuple):
         return info._replace(log_likelihood=likelihood, flags=info.flags | self.flags)
 
 
-def heard(R: Array, obs: Obs) -> Heard:
+def measured_with(R: Array, obs: Obs) -> Measurement:
     """Return the channels of an observation that can be used, and their noise.
 
     A channel of infinite variance is missing; one of which the value is not finite is left out with
@@ -85,7 +85,7 @@ def heard(R: Array, obs: Obs) -> Heard:
         Flag.NOT_FINITE: jnp.any(known & broken),
         Flag.INVALID_NOISE: jnp.any(improper) | failed,
     }
-    return Heard(obs._replace(valid=valid), mask_noise(R, valid), failed, flags_of(raised))
+    return Measurement(obs._replace(valid=valid), mask_noise(R, valid), failed, flags_of(raised))
 
 
 def masked_innovation(model: Model, obs: Obs, z_pred: Array) -> Array:
@@ -108,14 +108,14 @@ def require_channels(obs: Obs, observed: tuple[int, ...]) -> None:
         )
 
 
-def heard_by(model: Model, params: Any, x: Any, u: Any, obs: Obs) -> Heard:
+def measurement_of(model: Model, params: Any, x: Any, u: Any, obs: Obs) -> Measurement:
     """Return what can be used of an observation, with a model's noise at a state.
 
     Raises:
         ValueError: If observation, model and noise do not fit together.
     """
     require_channels(obs, jax.eval_shape(model.observe, params, x, u).shape)
-    return heard(model.observation_noise(params, x, u), obs)
+    return measured_with(model.observation_noise(params, x, u), obs)
 
 
 @kernel
@@ -173,7 +173,7 @@ def innovation_info(
     nu: Array,
     S: Array,
     root: Cholesky,
-    told: Heard,
+    measurement: Measurement,
     indefinite: Array,
     *,
     rooted: bool = False,
@@ -185,7 +185,7 @@ def innovation_info(
         nu: Innovation.
         S: Its covariance.
         root: The factor of ``S``.
-        told: What was used of the observation.
+        measurement: What was used of the observation.
         indefinite: Whether a covariance was not positive semi-definite in this step.
         rooted: Whether the factor was computed and ``S`` is its square, which has half the digits:
             the derivative is then taken through the factor, else through ``S`` at less cost.
@@ -201,7 +201,7 @@ def innovation_info(
         volume = log_volume(S, root.factor, known.inverse)
     usable = root.positive_definite
     nis = jnp.where(usable, distance, 0)
-    valid = told.obs.valid
+    valid = measurement.obs.valid
     channels = jnp.sum(valid).astype(S.dtype)
     log_likelihood = -0.5 * (nis + volume + channels * math.log(2 * math.pi))
     few_digits = root.reciprocal_pivot < ILL_CONDITIONED_EPS * jnp.finfo(S.dtype).eps
@@ -221,4 +221,4 @@ def innovation_info(
         used=valid,
         refused=jnp.zeros_like(valid),
     )
-    return told.upon(info)
+    return measurement.upon(info)

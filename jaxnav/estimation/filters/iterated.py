@@ -23,10 +23,10 @@ from jax import Array
 
 from jaxnav.estimation.checks import require_filter_params, require_own
 from jaxnav.estimation.filters.innovation import (
-    Heard,
-    heard_by,
+    Measurement,
     innovation_info,
     mask_noise,
+    measurement_of,
 )
 from jaxnav.estimation.filters.kalman import KalmanState, ekf
 from jaxnav.estimation.filters.line_search import Search, step_length
@@ -76,13 +76,13 @@ class _Form(NamedTuple):
     Attributes:
         base: The filter whose ``init`` and ``predict`` are used.
         rebuilt: ``(x, P) -> state``.
-        problem: ``(model, params, x, L, u, told) -> Problem``.
+        problem: ``(model, params, x, L, u, measurement) -> Problem``.
         slope: ``(model, problem, obs, point, search) -> (residual's mean, slope, spread noise)``.
     """
 
     base: Filter
     rebuilt: Callable[[Point, Array], Any]
-    problem: Callable[[Model, Params, Point, Array, Input, Heard], Problem]
+    problem: Callable[[Model, Params, Point, Array, Input, Measurement], Problem]
     slope: Callable[[Model, Problem, Obs, Array, Search], tuple[Array, Array, Array]]
 
 
@@ -213,9 +213,9 @@ def _iterated(
         prior = form.base.estimate(state)
         whitening = semidefinite_root(prior.cov)
         L = whitening.factor
-        told = heard_by(model, params.model, prior.mean, u, obs)
-        obs = told.obs
-        problem = form.problem(model, params.model, prior.mean, L, u, told)
+        measurement = measurement_of(model, params.model, prior.mean, u, obs)
+        obs = measurement.obs
+        problem = form.problem(model, params.model, prior.mean, L, u, measurement)
 
         def iterate(point: Array, _: None) -> tuple[Array, _Step]:
             at = jnp.zeros_like(point) if printed else point
@@ -240,7 +240,7 @@ def _iterated(
         x = model.retract(prior.mean, L @ point[: problem.states])
         mended = state.indefinite | ~whitening.semidefinite
         judged = first.root._replace(positive_definite=solvable)
-        info = innovation_info(first.slope.innovation, first.S, judged, told, mended)
+        info = innovation_info(first.slope.innovation, first.S, judged, measurement, mended)
         taken = jnp.sum(steps.moved).astype(jnp.int32)
         return form.rebuilt(x, symmetrise(L @ whitened @ L.T)), info._replace(iterations=taken)
 

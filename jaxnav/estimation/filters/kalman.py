@@ -16,10 +16,10 @@ from jax.ad_checkpoint import checkpoint_name
 
 from jaxnav.estimation.checks import require_filter_params, require_prior
 from jaxnav.estimation.filters.innovation import (
-    heard,
     innovation_info,
     is_covariance,
     masked_innovation,
+    measured_with,
     require_channels,
     require_step,
 )
@@ -131,8 +131,8 @@ def ekf(model: Model) -> Filter:
         n = state.P.shape[0]
         z_pred, push = observation_map(model, params.model, state.x, u, n)
         require_channels(obs, z_pred.shape)
-        told = heard(model.observation_noise(params.model, state.x, u), obs)
-        obs, R = told.obs, told.noise
+        measurement = measured_with(model.observation_noise(params.model, state.x, u), obs)
+        obs, R = measurement.obs, measurement.noise
         nu = masked_innovation(model, obs, z_pred)
         # A derivative that is not a number where a channel is missing must not reach a product.
         HP = jnp.where(obs.valid[:, None], push(state.P), 0)
@@ -150,7 +150,7 @@ def ekf(model: Model) -> Filter:
         joseph = matmul((matmul(R, gain) - HA).T, gain)
         P = state.P - explained(S, B, gain) + jax.lax.stop_gradient(joseph)
         x = model.retract(state.x, corrected(S, B, nu, gain, solution.weighed))
-        info = innovation_info(nu, S, root, told, state.indefinite, solution=solution)
+        info = innovation_info(nu, S, root, measurement, state.indefinite, solution=solution)
         return KalmanState(x, P, jnp.zeros_like(state.indefinite)), info
 
     def estimate(state: KalmanState) -> Gaussian:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxnav.estimation.checks import NOT_NEGATIVE, POSITIVE, Domain
-from jaxnav.estimation.filters.innovation import heard_by, masked_innovation
+from jaxnav.estimation.filters.innovation import masked_innovation, measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
     Wrapped,
@@ -158,9 +158,9 @@ def _reweighted(
 
     def update(params: FilterParams, state: Any, u: Input, obs: Obs) -> tuple[Any, Info]:
         kernel, params = parted(params, default)
-        told = heard_by(model, params.model, base.estimate(state).mean, u, obs)
-        obs = told.obs
-        L = cholesky(told.noise).factor
+        measurement = measurement_of(model, params.model, base.estimate(state).mean, u, obs)
+        obs = measurement.obs
+        L = cholesky(measurement.noise).factor
 
         def updated(R: Array, _: None) -> tuple[Array, tuple[Any, Info]]:
             moved, info = base.update(given(params, 1.0, R), state, u, obs)
@@ -170,11 +170,11 @@ def _reweighted(
             return matmul(L / w[None], L.T), (moved, info)
 
         # The plain update and those after it are one body in a loop: a third of it to compile.
-        _, (states, infos) = jax.lax.scan(updated, told.noise, None, length=iterations + 1)
+        _, (states, infos) = jax.lax.scan(updated, measurement.noise, None, length=iterations + 1)
         moved = jax.tree.map(lambda leaf: leaf[-1], states)
         info = jax.tree.map(lambda leaf: leaf[0], infos)
         flags = jax.lax.reduce(infos.flags, jnp.zeros((), jnp.int32), jax.lax.bitwise_or, (0,))
         info = info._replace(iterations=info.iterations + iterations, flags=flags)
-        return moved, told.upon(info)
+        return moved, measurement.upon(info)
 
     return base._replace(init=init, predict=predict, update=update, check=check, model=model, on=on)

@@ -18,7 +18,7 @@ from jax import Array
 
 from jaxnav.estimation.checks import POSITIVE, require_ordered
 from jaxnav.estimation.filters.adaptive import softly_clamped
-from jaxnav.estimation.filters.innovation import heard_by, mask_noise, masked_innovation
+from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
     given,
@@ -157,8 +157,10 @@ def sage_husa(
         params: FilterParams, state: SageHusaState, u: Input, obs: Obs
     ) -> tuple[SageHusaState, Info]:
         own, params = parted(params, SageHusa())
-        heard_now = heard_by(own_model, params.model, base.estimate(state.inner).mean, u, obs)
-        obs, nominal = heard_now.obs, heard_now.noise
+        measurement = measurement_of(
+            own_model, params.model, base.estimate(state.inner).mean, u, obs
+        )
+        obs, nominal = measurement.obs, measurement.noise
         root = cholesky(nominal)
         L, scalable = root.factor, root.positive_definite
 
@@ -173,12 +175,12 @@ def sage_husa(
             after = own_model.observe(params.model, base.estimate(inner).mean, u)
             e = masked_innovation(own_model, obs, after)
         sample = _sample(form, L, mask_noise(state.noise, obs.valid), e, info.innovation_cov)
-        told = obs.valid & scalable & jnp.isfinite(info.log_likelihood)
-        noise = _averaged(own, state, sample, told)
+        used = obs.valid & scalable & jnp.isfinite(info.log_likelihood)
+        noise = _averaged(own, state, sample, used)
         if form == "clamped":
             # Applied to what did not arrive too, the smooth clamp would move it step by step.
             variance = jnp.diag(noise)
-            noise = jnp.diag(jnp.where(told, _clamped(own, variance, smooth), variance))
+            noise = jnp.diag(jnp.where(used, _clamped(own, variance, smooth), variance))
         if current:
             inner, info = updated(noise)
         if form == "printed":
@@ -187,8 +189,8 @@ def sage_husa(
             info = info._replace(
                 flags=info.flags | jnp.where(lost, int(Flag.INDEFINITE), 0).astype(jnp.int32)
             )
-        samples = state.samples + told.astype(state.samples.dtype)
-        return SageHusaState(inner, noise, samples), heard_now.upon(info)
+        samples = state.samples + used.astype(state.samples.dtype)
+        return SageHusaState(inner, noise, samples), measurement.upon(info)
 
     def estimate(state: SageHusaState) -> Gaussian:
         return base.estimate(state.inner)
@@ -241,14 +243,14 @@ def _sample(form: NoiseForm, L: Array, N: Array, e: Array, S: Array) -> Array:
     return e[:, None] * e[None, :] - spread
 
 
-def _averaged(own: SageHusa, state: SageHusaState, sample: Array, told: Array) -> Array:
+def _averaged(own: SageHusa, state: SageHusaState, sample: Array, used: Array) -> Array:
     """Return the noise estimate with a sample ``(m, m)`` in the channels that told something."""
     share = averaging(own.forgetting, state.samples + own.prior_count)
-    d = jnp.where(told, share, 0)
+    d = jnp.where(used, share, 0)
     kept = jnp.where(d < 1, jnp.sqrt(jnp.where(d < 1, 1 - d, 1)), 0)
-    used = jnp.where(told, jnp.sqrt(jnp.where(told, share, 1)), 0)
-    known = jnp.where(told[:, None] & told[None, :], sample, 0)
-    return kept[:, None] * state.noise * kept[None, :] + used[:, None] * known * used[None, :]
+    root = jnp.where(used, jnp.sqrt(jnp.where(used, share, 1)), 0)
+    known = jnp.where(used[:, None] & used[None, :], sample, 0)
+    return kept[:, None] * state.noise * kept[None, :] + root[:, None] * known * root[None, :]
 
 
 def _clamped(own: SageHusa, variance: Array, smooth: bool) -> Array:

@@ -27,10 +27,10 @@ from jaxnav.estimation.filters.cloud import (
     without,
 )
 from jaxnav.estimation.filters.innovation import (
-    heard_by,
     innovation_info,
     is_covariance,
     masked_innovation,
+    measurement_of,
     require_step,
 )
 from jaxnav.estimation.filters.square_root import read_array
@@ -215,8 +215,8 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         params: FilterParams, state: SigmaPointState, u: Input, obs: Obs
     ) -> tuple[SigmaPointState, Info]:
         rule = _rule(params, rule_of, state.P.shape[0])
-        told = heard_by(model, params.model, state.x, u, obs)
-        obs, R = told.obs, told.noise
+        measurement = measurement_of(model, params.model, state.x, u, obs)
+        obs, R = measurement.obs, measurement.noise
         indefinite = state.indefinite
         cloud = state.points
         if redraw:
@@ -231,7 +231,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
         gain = jax.lax.optimization_barrier(gain)
         P = left(gain, state.P)
         x = model.retract(state.x, matmul(gain.T, nu))
-        info = innovation_info(nu, S, factor, told, indefinite)
+        info = innovation_info(nu, S, factor, measurement, indefinite)
         return SigmaPointState(x, symmetrise(P), state.points, jnp.zeros_like(indefinite)), info
 
     def estimate(state: SigmaPointState) -> Gaussian:
@@ -277,8 +277,8 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         params: FilterParams, state: SquareRootSigmaPointState, u: Input, obs: Obs
     ) -> tuple[SquareRootSigmaPointState, Info]:
         rule = _rule(params, rule_of, state.L.shape[0])
-        told = heard_by(model, params.model, state.x, u, obs)
-        obs, R = told.obs, told.noise
+        measurement = measurement_of(model, params.model, state.x, u, obs)
+        obs, R = measurement.obs, measurement.noise
         seen, nu = _observe(model, params, rule, state.x, drawn(rule, state.L), u, obs)
         seen = halves_of(seen)
         root, m = semidefinite_root(R).factor, R.shape[0]
@@ -291,7 +291,7 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
         done = read_array(triangle, m, state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
         indefinite = state.indefinite | ~sound
-        info = innovation_info(nu, done.S, done.root, told, indefinite, rooted=True)
+        info = innovation_info(nu, done.S, done.root, measurement, indefinite, rooted=True)
         return SquareRootSigmaPointState(x, done.L, jnp.zeros_like(indefinite)), info
 
     def estimate(state: SquareRootSigmaPointState) -> Gaussian:

@@ -8,10 +8,10 @@ from jax import Array
 
 from jaxnav.estimation.checks import require_filter_params, require_prior
 from jaxnav.estimation.filters.innovation import (
-    heard,
     innovation_info,
     is_covariance,
     masked_innovation,
+    measured_with,
     require_channels,
     require_step,
 )
@@ -112,14 +112,14 @@ def square_root_ekf(model: Model) -> Filter:
     ) -> tuple[SquareRootState, Info]:
         z_pred, push = observation_map(model, params.model, state.x, u, state.L.shape[0])
         require_channels(obs, z_pred.shape)
-        told = heard(model.observation_noise(params.model, state.x, u), obs)
-        obs, R = told.obs, told.noise
+        measurement = measured_with(model.observation_noise(params.model, state.x, u), obs)
+        obs, R = measurement.obs, measurement.noise
         nu = masked_innovation(model, obs, z_pred)
         HL = jnp.where(obs.valid[:, None], push(state.L), 0)
         triangle = tria_of_update(semidefinite_root(R).factor, HL, state.L)
         done = read_array(triangle, HL.shape[0], state.L)
         x = model.retract(state.x, done.gain_root @ solve_lower(done.root.factor, nu))
-        info = innovation_info(nu, done.S, done.root, told, state.indefinite, rooted=True)
+        info = innovation_info(nu, done.S, done.root, measurement, state.indefinite, rooted=True)
         return SquareRootState(x, done.L, jnp.zeros_like(state.indefinite)), info
 
     def estimate(state: SquareRootState) -> Gaussian:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.filters.innovation import Heard, masked_innovation
+from jaxnav.estimation.filters.innovation import Measurement, masked_innovation
 from jaxnav.estimation.filters.line_search import Search
 from jaxnav.estimation.types import Input, Model, Obs, Params, Point, difference
 from jaxnav.numerics.roots import semidefinite_root
@@ -52,16 +52,24 @@ class Problem(NamedTuple):
     added: Callable[[Array], Array] | None = None
 
 
-def additive(model: Model, params: Params, x: Point, L: Array, u: Input, told: Heard) -> Problem:
+def additive(
+    model: Model, params: Params, x: Point, L: Array, u: Input, measurement: Measurement
+) -> Problem:
     """Return the update over the state alone."""
     n = L.shape[0]
     sound = jnp.array(True)
     return Problem(
-        lambda at: model.observe(params, model.retract(x, L @ at), u), told.noise, n, n, sound
+        lambda at: model.observe(params, model.retract(x, L @ at), u),
+        measurement.noise,
+        n,
+        n,
+        sound,
     )
 
 
-def augmented(model: Model, params: Params, x: Point, L: Array, u: Input, told: Heard) -> Problem:
+def augmented(
+    model: Model, params: Params, x: Point, L: Array, u: Input, measurement: Measurement
+) -> Problem:
     """Return the update over the state and the noise of its observation."""
     n = L.shape[0]
     plain = lambda params, x, v, u: model.observe(params, x, u)  # noqa: E731
@@ -69,7 +77,7 @@ def augmented(model: Model, params: Params, x: Point, L: Array, u: Input, told: 
     in_values = model.residual is difference
     if model.noisy is None:
         # The noise has the units of the residual: metres, where values are latitudes in radians.
-        observe, given = adds if in_values else plain, told.noise
+        observe, given = adds if in_values else plain, measurement.noise
     else:
         observe, given = model.noisy.observe, model.noisy.noise(params, x, u)
         # What is infinite belongs to a channel that is missing.
@@ -80,7 +88,7 @@ def augmented(model: Model, params: Params, x: Point, L: Array, u: Input, told: 
     def predicted(at: Array) -> Array:
         return observe(params, model.retract(x, L @ at[:n]), factor @ at[n:], u)
 
-    none = jnp.zeros(told.obs.valid.shape, L.dtype)
+    none = jnp.zeros(measurement.obs.valid.shape, L.dtype)
     added = None if model.noisy is not None or in_values else lambda at: factor @ at[n:]
     return Problem(predicted, none, n, n + factor.shape[0], root.semidefinite, added)
 

@@ -132,7 +132,7 @@ def _best(factor: float, campaign: Campaign) -> Claim:
         for kind in KINDS[:2]
     ]
     worst = max(closest, key=lambda found: found.value)
-    told = ", ".join(f"{kind} {of.value:+.1%}" for kind, of in zip(KINDS, closest, strict=False))
+    each = ", ".join(f"{kind} {of.value:+.1%}" for kind, of in zip(KINDS, closest, strict=False))
     return Claim(
         id="arekf-is-best",
         text=f"AREKF is the best of the paper's methods in attitude and velocity, {factor:g} times",
@@ -140,7 +140,7 @@ def _best(factor: float, campaign: Campaign) -> Claim:
         measured=worst.value,
         ci95=(worst.low, worst.high),
         verdict=verdict(worst.high < 0),
-        why=f"against the closest of them: {told}; an MMAE over the scale of the noise, not in the "
+        why=f"against the closest of them: {each}; an MMAE over the scale of the noise, not in the "
         f"paper, {change(campaign, 'mmae', 'arekf', 'attitude').value:+.1%} in attitude",
     )
 
@@ -150,7 +150,7 @@ def _between(factor: float, campaign: Campaign, name: str) -> Claim:
     found = [change(campaign, name, "ekf", kind) for kind in KINDS[:2]]
     holds = all(of.high < 0 for of in found)
     worst = max(found, key=_upper)
-    told = f"attitude {found[0].value:+.1%}, velocity {found[1].value:+.1%}"
+    each = f"attitude {found[0].value:+.1%}, velocity {found[1].value:+.1%}"
     return Claim(
         id=f"{name}-beats-ekf",
         text=f"{name.upper()} beats the EKF in attitude and velocity, true noise {factor:g} times",
@@ -158,7 +158,7 @@ def _between(factor: float, campaign: Campaign, name: str) -> Claim:
         measured=worst.value,
         ci95=(worst.low, worst.high),
         verdict=verdict(holds),
-        why=told if holds else f"{told}: {NOTHING_ADAPTS}",
+        why=each if holds else f"{each}: {NOTHING_ADAPTS}",
     )
 
 
@@ -167,7 +167,7 @@ def _converges_alike(factor: float, campaign: Campaign) -> Claim:
     late = times[:, METHODS.index("arekf")] - times[:, METHODS.index("ekf")]
     per_kind = [mean_interval(late[:, j]) for j in range(len(KINDS))]
     worst = max(per_kind, key=lambda found: abs(found.value))
-    told = ", ".join(f"{kind} {of.value:+.2f} s" for kind, of in zip(KINDS, per_kind, strict=True))
+    each = ", ".join(f"{kind} {of.value:+.2f} s" for kind, of in zip(KINDS, per_kind, strict=True))
     return Claim(
         id="converges-alike",
         text=f"AREKF and EKF converge in about the same time, true noise {factor:g} times",
@@ -175,7 +175,7 @@ def _converges_alike(factor: float, campaign: Campaign) -> Claim:
         measured=worst.value,
         ci95=(worst.low, worst.high),
         verdict=verdict(all(max(abs(f.low), abs(f.high)) < SIMILAR_S for f in per_kind)),
-        why=f"first time below the threshold: {told}; an attitude that wanders more crosses it "
+        why=f"first time below the threshold: {each}; an attitude that wanders more crosses it "
         "earlier, so this measure of the paper says little",
     )
 
@@ -184,7 +184,7 @@ def _too_slow(latencies: Mapping[str, Latency] | None) -> Claim:
     text = "A step of the SE2(3)-EKF takes longer than the 2.5 ms of an inertial sample"
     if latencies is None:
         return Claim("se23-too-slow", text, None, None, None, "not testable", "not measured")
-    told = ", ".join(f"{name} {of.p99:.0f}" for name, of in latencies.items())
+    each = ", ".join(f"{name} {of.p99:.0f}" for name, of in latencies.items())
     return Claim(
         id="se23-too-slow",
         text=text,
@@ -192,7 +192,7 @@ def _too_slow(latencies: Mapping[str, Latency] | None) -> Claim:
         measured=latencies["se23-ekf"].p99,
         ci95=None,
         verdict="not testable",
-        why=f"the paper's is of a TMS320C6748; here 99 of 100 steps take less than, in us: {told}",
+        why=f"the paper's is of a TMS320C6748; here 99 of 100 steps take less than, in us: {each}",
     )
 
 
@@ -229,7 +229,7 @@ def _r_within_a_decade(config: ArekfConfig, campaign: Campaign, kind: int) -> Cl
         if i != own and low <= factor <= high
     }
     worst = max(found.values(), key=_upper, default=Interval(0.0, 0.0, 0.0))
-    told = ", ".join(f"{factor:g}: {of.value:+.1%}" for factor, of in found.items())
+    each = ", ".join(f"{factor:g}: {of.value:+.1%}" for factor, of in found.items())
     return Claim(
         id=f"r-within-a-decade-{KINDS[kind]}",
         text="Measurement noise (standard deviation) within an order of magnitude of the true one "
@@ -238,6 +238,6 @@ def _r_within_a_decade(config: ArekfConfig, campaign: Campaign, kind: int) -> Cl
         measured=worst.value,
         ci95=(worst.low, worst.high),
         verdict=verdict(worst.high < INSIGNIFICANT),
-        why=f"factors on the standard deviation, {told}; below {INSIGNIFICANT:.0%} is called "
+        why=f"factors on the standard deviation, {each}; below {INSIGNIFICANT:.0%} is called "
         "insignificant",
     )

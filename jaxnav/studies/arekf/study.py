@@ -69,11 +69,11 @@ def run_campaigns(
     factors = config.factors if config.scenario in DRIFTING else (1.0,)
     total = config.runs * len(factors)
 
-    def told(before: int) -> Callable[[int, int], None]:
+    def tell(before: int) -> Callable[[int, int], None]:
         return lambda done, of: None if progress is None else progress(before + done, total)
 
     return {
-        factor: run_campaign(config, factor, progress=told(i * config.runs))
+        factor: run_campaign(config, factor, progress=tell(i * config.runs))
         for i, factor in enumerate(factors)
     }
 
@@ -181,7 +181,7 @@ def _notes(
     if config.runs >= 2:
         low, high = chi2_mean_bounds(STATES, config.runs)
         at = epochs_of(len(campaign.mean_curve["nees"]))
-        told = ("ekf", "arekf", "oracle") if config.scenario in DRIFTING else names
+        compared = ("ekf", "arekf", "oracle") if config.scenario in DRIFTING else names
         notes.append(
             f"ANEES of the {STATES} states at {EPOCHS} times, smallest and largest; a consistent "
             f"filter is within {low:.1f} and {high:.1f}: "
@@ -190,7 +190,7 @@ def _notes(
                 + ", ".join(
                     f"{name} {nees.min():.1f} {nees.max():.1f}"
                     for name, nees in zip(names, own.mean_curve["nees"][at].T, strict=True)
-                    if name in told
+                    if name in compared
                 )
                 for s, own in campaigns.items()
             )

@@ -54,7 +54,7 @@ class Member(NamedTuple):
 
     model: SinsCnsParams
     initial: Gaussian
-    told: Array
+    informed: Array
 
 
 class Shared(NamedTuple):
@@ -89,7 +89,7 @@ def members_filter(
     """Return the Kalman filter of the error model, informed where its member is told."""
 
     def informed(member: Member, u: SinsCnsInput) -> FilterParams:
-        scale = jnp.where(member.told, u.true_scale, member.model.noise_scale)
+        scale = jnp.where(member.informed, u.true_scale, member.model.noise_scale)
         return FilterParams(member.model._replace(noise_scale=scale), member.initial)
 
     return oracle(kf(model(period, imu_step)), informed)
@@ -104,7 +104,7 @@ def panel_params(config: ImmaeConfig) -> BankParams:
     members = Member(
         model=same.model._replace(noise_scale=theta),
         initial=same.initial,
-        told=host.arange(count) == count - 1,
+        informed=host.arange(count) == count - 1,
     )
     period = config.reset_period_s / config.filter_period_s
     rules: dict[str, Any] = {

@@ -234,12 +234,12 @@ def _rivals(config: ImmaeConfig) -> BankParams:
     whole = panel_params(config)
     models = len(config.theta)
     members = attitude_members(config, jnp.array([*config.theta, 1.0]))
-    members = members._replace(told=jnp.arange(models + 1) == models)
+    members = members._replace(informed=jnp.arange(models + 1) == models)
     rules = {name: whole.rule[name] for name in ("immae", "markov", "oracle")}
     reset = whole.rule["immae"][1]
     rules["hand-set"] = (whole.rule["markov"][0], (), reset)
-    priors = {name: jnp.where(members.told, -jnp.inf, 0.0) for name in PANEL}
-    priors["oracle"] = jnp.where(members.told, 0.0, -jnp.inf)
+    priors = {name: jnp.where(members.informed, -jnp.inf, 0.0) for name in PANEL}
+    priors["oracle"] = jnp.where(members.informed, 0.0, -jnp.inf)
     return BankParams(members, rules, priors)
 
 

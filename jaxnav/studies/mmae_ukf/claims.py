@@ -71,7 +71,7 @@ def _bank_beats_single(campaign: Campaign, bank: str, single: str) -> Claim:
     change = gain(campaign, bank, single)
     axes = _per_axis(campaign, bank, single)
     ceiling = gain(campaign, "oracle", single)
-    told = ", ".join(f"{axis} {of.value:+.1%}" for axis, of in zip(AXES, axes, strict=True))
+    each = ", ".join(f"{axis} {of.value:+.1%}" for axis, of in zip(AXES, axes, strict=True))
     return Claim(
         id=f"{bank}-beats-{single}",
         text=f"{bank.upper()} is more accurate than {single.upper()} in all three angles",
@@ -79,7 +79,7 @@ def _bank_beats_single(campaign: Campaign, bank: str, single: str) -> Claim:
         measured=change.value,
         ci95=(change.low, change.high),
         verdict=verdict(all(of.high < 0 for of in axes)),
-        why=f"{told}; {MEMORY if ceiling.value < 0 else BAD_START} ({ceiling.value:+.1%} for "
+        why=f"{each}; {MEMORY if ceiling.value < 0 else BAD_START} ({ceiling.value:+.1%} for "
         "the filter that is told the noise)",
     )
 
@@ -115,7 +115,7 @@ def _most_expensive(costs: dict[str, float] | None) -> Claim:
         )
     own = costs["mmae-ukf"]
     next_dearest = max(costs[name] for name in PAPERS_METHODS if name != "mmae-ukf")
-    told = ", ".join(f"{name} {costs[name]:.3g}" for name in PAPERS_METHODS)
+    each = ", ".join(f"{name} {costs[name]:.3g}" for name in PAPERS_METHODS)
     return Claim(
         id="mmae-ukf-costs-most",
         text=text,
@@ -123,7 +123,7 @@ def _most_expensive(costs: dict[str, float] | None) -> Claim:
         measured=own / next_dearest,
         ci95=None,
         verdict=verdict(own > next_dearest),
-        why=f"microseconds per step: {told}; the measure is the ratio to the next dearest",
+        why=f"microseconds per step: {each}; the measure is the ratio to the next dearest",
     )
 
 

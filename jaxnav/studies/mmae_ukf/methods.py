@@ -69,7 +69,7 @@ class Member(NamedTuple):
     """Parameters of one member: those of its filter, and whether it is told the true noise."""
 
     filter: FilterParams
-    told: Array
+    informed: Array
 
 
 class Shared(NamedTuple):
@@ -120,15 +120,15 @@ def model_of(setup: Setup) -> Model:
 def informed(filter: Filter) -> Filter:
     """Return a filter with :class:`Member` as parameters, told the truth where its member is."""
 
-    def told(member: Member, u: SinsTotalInput) -> FilterParams:
-        scale = jnp.where(member.told, jnp.sqrt(u.true_scale), 1)
+    def informed(member: Member, u: SinsTotalInput) -> FilterParams:
+        scale = jnp.where(member.informed, jnp.sqrt(u.true_scale), 1)
         model = member.filter.model
         model = model._replace(
             gyro_noise=scale * model.gyro_noise, accel_noise=scale * model.accel_noise
         )
         return member.filter._replace(model=model)
 
-    return oracle(filter, told)._replace(init=lambda member: filter.init(member.filter))
+    return oracle(filter, informed)._replace(init=lambda member: filter.init(member.filter))
 
 
 def model_factors(config: MmaeUkfConfig) -> np.ndarray:
@@ -147,7 +147,7 @@ def shared_of(config: MmaeUkfConfig, world: World) -> Shared:
     models = config.models
     period = config.reset_period_s / config.filter_period_s
     reset = WindowedReset(host.array(period), host.array(config.reset_threshold))
-    bank, alone, told = (_prior(models + 2, chosen) for chosen in (range(models), [-2], [-1]))
+    bank, alone, informed = (_prior(models + 2, chosen) for chosen in (range(models), [-2], [-1]))
     return Shared(
         world=world,
         ekf=BankParams(
@@ -156,9 +156,9 @@ def shared_of(config: MmaeUkfConfig, world: World) -> Shared:
             {"ekf": alone[:-1], "mmae-ekf": bank[:-1]},
         ),
         ukf=BankParams(
-            _members(config, world, host.concatenate([grid, nominal, nominal]), told=True),
+            _members(config, world, host.concatenate([grid, nominal, nominal]), informed=True),
             {"ukf": (), "mmae-ukf": (), "immae-ukf": ((), reset), "oracle": ()},
-            {"ukf": alone, "mmae-ukf": bank, "immae-ukf": bank, "oracle": told},
+            {"ukf": alone, "mmae-ukf": bank, "immae-ukf": bank, "oracle": informed},
         ),
         imm=imm_params(_members(config, world, grid), uniform_switching(models, config.switching)),
     )
@@ -172,7 +172,7 @@ def _prior(count: int, chosen: Any) -> Array:
 
 
 def _members(
-    config: MmaeUkfConfig, world: World, factors: np.ndarray, *, told: bool = False
+    config: MmaeUkfConfig, world: World, factors: np.ndarray, *, informed: bool = False
 ) -> Member:
     """Return members by their factors ``(C, 2)``; the last one may be told the truth."""
     count = factors.shape[0]
@@ -185,13 +185,13 @@ def _members(
     anywhere = SinsTotal(host.eye(3), *(host.zeros(3) for _ in range(4)))
     initial = replicate(Gaussian(anywhere, host.diag(world.prior_sigma**2)), count)
     last = host.arange(count) == count - 1
-    return Member(FilterParams(scaled, initial), last & told)
+    return Member(FilterParams(scaled, initial), last & informed)
 
 
 def started(params: Any, start: SinsTotal) -> Any:
     """Return the parameters of a bank or of one member, its filters starting from one state."""
     if isinstance(params, BankParams):
-        count = params.members.told.shape[0]
+        count = params.members.informed.shape[0]
         return params._replace(members=_restarted(params.members, replicate(start, count)))
     return _restarted(params, start)
 

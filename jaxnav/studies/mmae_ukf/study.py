@@ -104,12 +104,12 @@ def _notes(config: MmaeUkfConfig, campaign: Campaign) -> list[str]:
     """Sentences on what adaptation gains; banks whose memory fades are not in the paper."""
     if config.runs < 2:
         return []
-    told = ", ".join(
+    each = ", ".join(
         f"{name} {change.value:+.2%} [{change.low:+.2%}, {change.high:+.2%}]"
         for name in ("mmae-ukf", "immae-ukf", "imm-ukf", "oracle")
         for change in [gain(campaign, name, "ukf")]
     )
-    notes = [f"Change of RMSE against the UKF, mean of the angles, 95 %: {told}."]
+    notes = [f"Change of RMSE against the UKF, mean of the angles, 95 %: {each}."]
     if config.scenario == "large-misalignment":
         notes.append(
             f"RMSE from {config.settle_s:g} s on, star tracker as {config.star_form}; "

@@ -186,7 +186,7 @@ def _same_order(config: RkcnsConfig, costs: dict[str, float] | None) -> Claim:
             "same-order-of-cost", text, printed, None, None, "not testable", "cost not measured"
         )
     ratio = costs["modified-iterated-ckf"] / costs["ckf"]
-    told = ", ".join(f"{name} {counted[name]:.3g} flops, {costs[name]:.3g} us" for name in counted)
+    each = ", ".join(f"{name} {counted[name]:.3g} flops, {costs[name]:.3g} us" for name in counted)
     return Claim(
         id="same-order-of-cost",
         text=text,
@@ -194,7 +194,7 @@ def _same_order(config: RkcnsConfig, costs: dict[str, float] | None) -> Claim:
         measured=ratio,
         ci95=None,
         verdict=verdict(ratio < 10),
-        why=f"Eqs. (29)-(31) with n = 15, m = {6 + config.stars}, L = {config.iterations}: {told}",
+        why=f"Eqs. (29)-(31) with n = 15, m = {6 + config.stars}, L = {config.iterations}: {each}",
     )
 
 

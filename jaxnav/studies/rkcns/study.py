@@ -69,15 +69,15 @@ def _run_scenario(config: RkcnsConfig, progress: Callable[[int, int], None] | No
     chosen = variations(config) if config.ablations else ()
     total = config.runs * (1 + len(chosen))
 
-    def told(done: int, of: int) -> None:
+    def tell(done: int, of: int) -> None:
         del of
         if progress is not None:
             progress(done, total)
 
-    campaign = run_campaign(config, keep=1, progress=told)
+    campaign = run_campaign(config, keep=1, progress=tell)
     timed = config.cost and config.scenario == "listed"
     costs = cost.step_costs(config) if timed else None
-    outcomes = run_ablations(config, chosen, lambda done, of: told(config.runs * (1 + done), of))
+    outcomes = run_ablations(config, chosen, lambda done, of: tell(config.runs * (1 + done), of))
     arrays, dims = _arrays(config, campaign, limb)
     if outcomes:
         arrays |= {
@@ -155,11 +155,11 @@ def _notes(
     ]
     if config.runs >= 2:
         bounds = chi2_mean_bounds(STATES, config.runs)
-        told = ", ".join(
+        each = ", ".join(
             f"{name} {campaign.rows.final_nees[:, i].mean():.2f}" for i, name in enumerate(METHODS)
         )
         notes.append(
-            f"ANEES of the {STATES} states at the end: {told}; a consistent filter is within "
+            f"ANEES of the {STATES} states at the end: {each}; a consistent filter is within "
             f"{bounds[0]:.2f} and {bounds[1]:.2f} but for one case in a million."
         )
     notes += [

@@ -132,7 +132,7 @@ def _normaliser_does_nothing(config: SageHusaConfig, campaign: Campaign) -> Clai
         change(config, campaign, "unnormalised-floor", "proposed-bayes-floor", i) for i in NOISY
     ]
     worst = max(found, key=lambda of: of.value)
-    told = ", ".join(f"{of.value:+.1%}" for of in found)
+    each = ", ".join(f"{of.value:+.1%}" for of in found)
     return Claim(
         id="normaliser-has-no-effect",
         text="Leaving the likelihood's normaliser out has no effect",
@@ -140,7 +140,7 @@ def _normaliser_does_nothing(config: SageHusaConfig, campaign: Campaign) -> Clai
         measured=worst.value,
         ci95=(worst.low, worst.high),
         verdict=verdict(worst.low <= 0 <= worst.high),
-        why=f"MSE without it over that with it, all else the same, in the noisy intervals: {told}; "
+        why=f"MSE without it over that with it, all else the same, in the noisy intervals: {each}; "
         "it differs from model to model, and without it the member wins whose S follows the "
         "innovation the closest",
     )
@@ -192,7 +192,7 @@ def _identifies_faster(config: SageHusaConfig, campaign: Campaign) -> Claim:
         below = np.flatnonzero(share[:, list(BANKS).index(name)] < FOUND)
         last = below[-1] + 1 if below.size else 0
         times[name] = config.fix_interval_s * last if last < len(share) else np.inf
-    told = ", ".join(
+    each = ", ".join(
         f"{name} {f'{at:g} s' if np.isfinite(at) else 'never'}" for name, at in times.items()
     )
     gain = times["proposed"] - times["proposed-bayes"]
@@ -204,5 +204,5 @@ def _identifies_faster(config: SageHusaConfig, campaign: Campaign) -> Claim:
         ci95=None,
         verdict=verdict(times["proposed"] < times["proposed-bayes"]),
         why="time from which the mean weight of the members with the Q nearest the truth stays "
-        f"above {FOUND:g}: {told}",
+        f"above {FOUND:g}: {each}",
     )

@@ -134,11 +134,11 @@ def _notes(config: SageHusaConfig, campaign: Campaign) -> list[str]:
     ]
     for i, span in enumerate(config.intervals_s):
         rival = best_single(config, campaign, i)
-        told = []
+        each = []
         for name in (*BANKS, "mmae", "oracle-r", "oracle"):
             found = change(config, campaign, name, rival, i)
-            told.append(f"{name} {found.value:+.1%} [{found.low:+.1%}, {found.high:+.1%}]")
-        notes.append(f"{span_name(span)} s, MSE against {rival}: " + ", ".join(told))
+            each.append(f"{name} {found.value:+.1%} [{found.low:+.1%}, {found.high:+.1%}]")
+        notes.append(f"{span_name(span)} s, MSE against {rival}: " + ", ".join(each))
     return notes
 
 
