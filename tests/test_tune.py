@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from jaxnav.compiling import compiled
-from jaxnav.estimation.banks.mixture import BankParams, bank, mmae, rewatch
+from jaxnav.estimation.banks.mixture import BankParams, bank, mmae, reweighed
 from jaxnav.estimation.banks.reset import WindowedReset, windowed_reset
 from jaxnav.estimation.banks.weights import bayes, chain, floor, markov
 from jaxnav.estimation.filters.kalman import kf
@@ -279,7 +279,7 @@ def test_a_rule_over_members_that_have_run_gives_the_weights_of_their_bank() -> 
 
     expected = run(bank(kf(SCALAR), rule), params, inputs, observations, record=weights).record
     each = jax.vmap(lambda own: run(kf(SCALAR), own, inputs, observations).record[1], out_axes=1)
-    watched = run(rewatch(rule), params, each(members), observations, record=weights).record
+    watched = run(reweighed(rule), params, each(members), observations, record=weights).record
     np.testing.assert_allclose(watched, expected, rtol=1e-12, atol=1e-12)
 
 

@@ -107,7 +107,7 @@ def mismatched(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> F
     def estimate(state: MismatchState) -> Gaussian:
         return Gaussian(state.x, state.actual)
 
-    def restart(state: MismatchState, given: Gaussian) -> MismatchState:
-        return MismatchState(given.mean, state.believed, given.cov)
+    def restart(state: MismatchState, estimate: Gaussian) -> MismatchState:
+        return MismatchState(estimate.mean, state.believed, estimate.cov)
 
     return Filter(init, predict, update, estimate, restart, model.retract, model.local)

@@ -47,7 +47,7 @@ def rotated_diagonal(C: Array, variances: Array) -> Array:
     return matmul(C * variances[None], C.T)
 
 
-def materialised(tree: Any) -> Any:
+def computed_once(tree: Any) -> Any:
     """Return small arrays as they are, computed once wherever they are used after.
 
     XLA on CPUs fuses what is cheap to write into every loop that reads it, and computes it there

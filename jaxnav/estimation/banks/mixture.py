@@ -133,8 +133,8 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
 
         return _by_name(names, jax.vmap(mixed)(_stacked(names, state)))
 
-    def restart(state: PanelState, given: Gaussian) -> PanelState:
-        members = jax.vmap(filter.restart, in_axes=(0, None))(state.members, given)
+    def restart(state: PanelState, estimate: Gaussian) -> PanelState:
+        members = jax.vmap(filter.restart, in_axes=(0, None))(state.members, estimate)
         return state._replace(members=members)
 
     local, model = filter.local, filter.model
@@ -196,8 +196,8 @@ def bank(filter: Filter, rule: WeightRule) -> Filter:
     def estimate(state: BankState) -> Gaussian:
         return single.estimate(wide_state(state))[""]
 
-    def restart(state: BankState, given: Gaussian) -> BankState:
-        return narrow(single.restart(wide_state(state), given))
+    def restart(state: BankState, estimate: Gaussian) -> BankState:
+        return narrow(single.restart(wide_state(state), estimate))
 
     local, model = filter.local, filter.model
     return Filter(init, predict, update, estimate, restart, filter.retract, local, check, model)
@@ -213,7 +213,7 @@ def require_bank_params(filter: Filter, params: Any) -> int:
     return require_members(filter.check, params.members)
 
 
-def rewatch(rule: WeightRule) -> Filter:
+def reweighed(rule: WeightRule) -> Filter:
     """Return a bank whose members have already run: its input is their :class:`Info` of the step.
 
     The members of a bank never interact, so another rule, or the same with other parameters, needs
@@ -236,8 +236,8 @@ def rewatch(rule: WeightRule) -> Filter:
         memory, moved = rule.update(params.rule, state.rule, state.log_weights, u, state.step)
         return state._replace(rule=memory, log_weights=moved), moved
 
-    def restart(state: BankState, given: Any) -> BankState:
-        return state._replace(log_weights=given)
+    def restart(state: BankState, estimate: Any) -> BankState:
+        return state._replace(log_weights=estimate)
 
     return Filter(init, predict, update, lambda state: state.log_weights, restart)
 

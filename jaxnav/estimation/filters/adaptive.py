@@ -10,10 +10,10 @@ from jaxnav.estimation.checks import POSITIVE, require_ordered
 from jaxnav.estimation.filters.innovation import measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
-    given,
     parted,
     require_wrapper,
     with_given_noise,
+    with_noise,
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
@@ -118,7 +118,7 @@ def innovation_adaptive(
 
     def predict(params: FilterParams, state: AdaptiveState, u: Input) -> AdaptiveState:
         _, inner = parted(params, Adaptation())
-        scaled = given(inner, jnp.exp(state.log_factor), 0.0)
+        scaled = with_noise(inner, jnp.exp(state.log_factor), 0.0)
         return state._replace(inner=base.predict(scaled, state.inner, u))
 
     def update(
@@ -129,7 +129,7 @@ def innovation_adaptive(
             own_model, params.model, base.estimate(state.inner).mean, u, obs
         )
         inner, info = base.update(
-            given(params, 1.0, measurement.noise), state.inner, u, measurement.obs
+            with_noise(params, 1.0, measurement.noise), state.inner, u, measurement.obs
         )
         moved = moved_log_factor(own, state.log_factor, info, measurement.obs, smooth=smooth)
         return AdaptiveState(inner, moved), measurement.upon(info)

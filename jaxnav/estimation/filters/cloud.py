@@ -53,7 +53,7 @@ def once(points: Array) -> Array:
     """Return points ``(2 n, d)`` as they are, the model's function computed once for each.
 
     Every sum over the points would compute it anew; see
-    :func:`~jaxnav.numerics.linalg.materialised`.
+    :func:`~jaxnav.numerics.linalg.computed_once`.
     """
     return points @ jnp.eye(points.shape[1], dtype=points.dtype)
 

@@ -135,8 +135,8 @@ def gated(filter: Filter, groups: Sequence[str | Sequence[int]] | None = None) -
     def estimate(state: GatedState) -> Any:
         return filter.estimate(state.inner)
 
-    def restart(state: GatedState, given: Gaussian) -> GatedState:
-        return state._replace(inner=filter.restart(state.inner, given))
+    def restart(state: GatedState, estimate: Gaussian) -> GatedState:
+        return state._replace(inner=filter.restart(state.inner, estimate))
 
     build, retract, local = filter.on, filter.retract, filter.local
     on = build and (lambda model: gated(build(model), groups))

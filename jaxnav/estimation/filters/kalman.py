@@ -156,8 +156,8 @@ def ekf(model: Model) -> Filter:
     def estimate(state: KalmanState) -> Gaussian:
         return Gaussian(state.x, symmetrise(state.P))
 
-    def restart(state: KalmanState, given: Gaussian) -> KalmanState:
-        return KalmanState(*given, state.indefinite)
+    def restart(state: KalmanState, estimate: Gaussian) -> KalmanState:
+        return KalmanState(*estimate, state.indefinite)
 
     retract, local = model.retract, model.local
     return Filter(init, predict, update, estimate, restart, retract, local, check, model, ekf)

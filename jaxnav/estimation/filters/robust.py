@@ -23,11 +23,11 @@ from jaxnav.estimation.filters.innovation import masked_innovation, measurement_
 from jaxnav.estimation.filters.wrapping import (
     Builder,
     Wrapped,
-    given,
     parted,
     require_additive,
     require_wrapper,
     with_given_noise,
+    with_noise,
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
@@ -154,7 +154,7 @@ def _reweighted(
         return base.init(parted(params, default)[1])
 
     def predict(params: FilterParams, state: Any, u: Input) -> Any:
-        return base.predict(given(parted(params, default)[1], 1.0, 0.0), state, u)
+        return base.predict(with_noise(parted(params, default)[1], 1.0, 0.0), state, u)
 
     def update(params: FilterParams, state: Any, u: Input, obs: Obs) -> tuple[Any, Info]:
         kernel, params = parted(params, default)
@@ -163,7 +163,7 @@ def _reweighted(
         L = cholesky(measurement.noise).factor
 
         def updated(R: Array, _: None) -> tuple[Array, tuple[Any, Info]]:
-            moved, info = base.update(given(params, 1.0, R), state, u, obs)
+            moved, info = base.update(with_noise(params, 1.0, R), state, u, obs)
             seen = model.observe(params.model, base.estimate(moved).mean, u)
             e = solve_lower(L, masked_innovation(model, obs, seen))
             w = jnp.maximum(weight(kernel, e * e), LEAST_WEIGHT)

@@ -21,11 +21,11 @@ from jaxnav.estimation.filters.adaptive import softly_clamped
 from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
-    given,
     parted,
     require_additive,
     require_wrapper,
     with_given_noise,
+    with_noise,
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
@@ -151,7 +151,7 @@ def sage_husa(
 
     def predict(params: FilterParams, state: SageHusaState, u: Input) -> SageHusaState:
         _, inner = parted(params, SageHusa())
-        return state._replace(inner=base.predict(given(inner, 1.0, 0.0), state.inner, u))
+        return state._replace(inner=base.predict(with_noise(inner, 1.0, 0.0), state.inner, u))
 
     def update(
         params: FilterParams, state: SageHusaState, u: Input, obs: Obs
@@ -167,7 +167,7 @@ def sage_husa(
         def updated(noise: Array) -> tuple[Any, Info]:
             scaled = symmetrise(matmul(matmul(L, mask_noise(noise, obs.valid)), L.T))
             R = jnp.where(scalable, scaled, nominal)
-            return base.update(given(params, 1.0, R), state.inner, u, obs)
+            return base.update(with_noise(params, 1.0, R), state.inner, u, obs)
 
         inner, info = updated(state.noise)
         e = info.innovation

@@ -237,9 +237,9 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
     def estimate(state: SigmaPointState) -> Gaussian:
         return Gaussian(state.x, state.P)
 
-    def restart(state: SigmaPointState, given: Gaussian) -> SigmaPointState:
+    def restart(state: SigmaPointState, estimate: Gaussian) -> SigmaPointState:
         # Points that were kept stay until the next prediction makes them anew.
-        return SigmaPointState(given.mean, given.cov, state.points, state.indefinite)
+        return SigmaPointState(estimate.mean, estimate.cov, state.points, state.indefinite)
 
     def on(other: Model) -> Filter:
         return _sigma_point(other, rule_of, redraw)
@@ -297,10 +297,10 @@ def _square_root(model: Model, rule_of: RuleOf) -> Filter:
     def estimate(state: SquareRootSigmaPointState) -> Gaussian:
         return Gaussian(state.x, state.L @ state.L.T)
 
-    def restart(state: SquareRootSigmaPointState, given: Gaussian) -> SquareRootSigmaPointState:
-        root = semidefinite_root(given.cov)
+    def restart(state: SquareRootSigmaPointState, estimate: Gaussian) -> SquareRootSigmaPointState:
+        root = semidefinite_root(estimate.cov)
         indefinite = state.indefinite | ~root.semidefinite
-        return SquareRootSigmaPointState(given.mean, root.factor, indefinite)
+        return SquareRootSigmaPointState(estimate.mean, root.factor, indefinite)
 
     def on(other: Model) -> Filter:
         return _square_root(other, rule_of)

@@ -125,10 +125,10 @@ def square_root_ekf(model: Model) -> Filter:
     def estimate(state: SquareRootState) -> Gaussian:
         return Gaussian(state.x, state.L @ state.L.T)
 
-    def restart(state: SquareRootState, given: Gaussian) -> SquareRootState:
-        root = semidefinite_root(given.cov)
+    def restart(state: SquareRootState, estimate: Gaussian) -> SquareRootState:
+        root = semidefinite_root(estimate.cov)
         indefinite = state.indefinite | ~root.semidefinite
-        return SquareRootState(given.mean, root.factor, indefinite)
+        return SquareRootState(estimate.mean, root.factor, indefinite)
 
     retract, local = model.retract, model.local
     return Filter(

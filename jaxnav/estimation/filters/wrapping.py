@@ -121,7 +121,9 @@ def with_given_noise(model: Model) -> Model:
     )
 
 
-def given(params: FilterParams, process: Array | float, observation: Array | float) -> FilterParams:
+def with_noise(
+    params: FilterParams, process: Array | float, observation: Array | float
+) -> FilterParams:
     """Return a filter's parameters with the noise handed to its model."""
     return params._replace(model=GivenNoise(params.model, process, observation))
 

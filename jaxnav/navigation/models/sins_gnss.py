@@ -36,7 +36,7 @@ from jaxnav.navigation.states import LAYOUT, ErrorForm, LevelError, SinsLevel, e
 from jaxnav.navigation.strapdown.base import NavState
 from jaxnav.navigation.strapdown.local_level import level_step
 from jaxnav.numerics.lie import skew, so3_exp, so3_left_jacobian
-from jaxnav.numerics.linalg import materialised, matmul, rotated_diagonal
+from jaxnav.numerics.linalg import computed_once, matmul, rotated_diagonal
 
 
 class SinsGnssParams(NamedTuple):
@@ -266,7 +266,7 @@ def _slopes(x: SinsLevel, ahead: SinsLevel, u: SinsGnssInput, earth: Earth) -> _
     back = so3_exp(-dt * (rates[0] + rates[1]))
     swap = jnp.array([1, 0, 2])
     metres = [metres_per_radian(at, earth) for at in (x.position, ahead.position)]
-    return materialised(
+    return computed_once(
         _Slopes(
             back=back,
             felt=matmul(x.dcm, gain),

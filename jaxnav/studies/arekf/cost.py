@@ -27,7 +27,7 @@ def step_latencies(config: ArekfConfig) -> dict[str, Latency]:
     flight = compiled(fly_run, static_argnames="timing")(
         jax.random.key(config.seed), world, timing=timing_of(config)
     )
-    single = FilterParams(shared.given, flight.start)
+    single = FilterParams(shared.believed, flight.start)
 
     def of(name: str) -> tuple[Filter, Any]:
         if name == "ekf":

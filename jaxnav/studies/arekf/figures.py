@@ -101,10 +101,10 @@ def _draw_axes(result: StudyResult, path: Path, kind: str) -> None:
         grid[0, 1].legend(fontsize=8, loc="lower left")
         for axes in grid[-1]:
             axes.set_xlabel("time of flight [s]")
-        drawing.suptitle(f"{kind} error, {_told(result)}")
+        drawing.suptitle(f"{kind} error, {_noise_of(result)}")
 
 
-def _told(result: StudyResult) -> str:
+def _noise_of(result: StudyResult) -> str:
     drifting = result.scenario in DRIFTING
     drift = f", true noise {result.config['reported']:g} times that given" if drifting else ""
     return f"{result.scenario}{drift}, {result.runs} runs"
@@ -131,7 +131,7 @@ def _draw_anees(result: StudyResult, path: Path) -> None:
         axes.set_xlabel("time of flight [s]")
         axes.set_ylabel(f"ANEES of {states} states")
         _legend_below(drawing, axes)
-        axes.set_title(_told(result))
+        axes.set_title(_noise_of(result))
 
 
 def _draw_ratio(result: StudyResult, path: Path) -> None:

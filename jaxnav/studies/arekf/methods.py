@@ -50,14 +50,14 @@ class Shared(NamedTuple):
 
     Attributes:
         world: The world.
-        given: Noise that the filters were given.
+        believed: Noise that the filters were given.
         kernel: Numbers of the Versoria filter.
         adaptation: Numbers of the innovation-based adaptation.
         settle: Time of flight from which errors count [s].
     """
 
     world: World
-    given: SinsGnssParams
+    believed: SinsGnssParams
     kernel: Versoria
     adaptation: Adaptation
     settle: Array
@@ -96,14 +96,14 @@ def setup_of(config: ArekfConfig) -> Setup:
 
 def shared_of(config: ArekfConfig, world: World, factor: float) -> Shared:
     """Return what all runs share when the given noise is too small by a factor."""
-    given = world.noise._replace(
+    believed = world.noise._replace(
         gyro_noise=world.noise.gyro_noise / factor, accel_noise=world.noise.accel_noise / factor
     )
     kernel = Versoria(host.array(config.versoria_width), host.array(config.versoria_power))
     adaptation = Adaptation(*(host.array(x) for x in Adaptation(config.iae_memory)))
     late = config.scenario == "large-heading-error"
     settle = host.array(config.settle_s if late else 0.0)
-    return Shared(world, given, kernel, adaptation, settle)
+    return Shared(world, believed, kernel, adaptation, settle)
 
 
 @cache
@@ -141,20 +141,20 @@ def params_of(name: str, flight: Run, shared: Shared, scales: Sequence[float]) -
 
     cov = own(own(start.cov).T)
     of_wrappers = {"versoria-ekf": shared.kernel, "iae": shared.adaptation}
-    return FilterParams(shared.given, Gaussian(start.mean, cov), of_wrappers.get(name, ()))
+    return FilterParams(shared.believed, Gaussian(start.mean, cov), of_wrappers.get(name, ()))
 
 
 def _panel_params(flight: Run, shared: Shared, scales: Sequence[float]) -> BankParams:
     """Return members at each scale, then that of the identified noise and that of the true one."""
     count = len(scales)
-    walks = (shared.given.gyro_noise, shared.given.accel_noise)
+    walks = (shared.believed.gyro_noise, shared.believed.accel_noise)
     truth = (shared.world.noise.gyro_noise, shared.world.noise.accel_noise)
     grid = jnp.asarray(scales, walks[0].dtype)[:, None]
     gyro, accel = (
-        jnp.concatenate([grid * given[None], known[None], true[None]])
-        for given, known, true in zip(walks, flight.identified, truth, strict=True)
+        jnp.concatenate([grid * believed[None], known[None], true[None]])
+        for believed, known, true in zip(walks, flight.identified, truth, strict=True)
     )
-    members = replicate(FilterParams(shared.given, flight.start), count + 2)
+    members = replicate(FilterParams(shared.believed, flight.start), count + 2)
     noise = members.model._replace(gyro_noise=gyro, accel_noise=accel)
     index = jnp.arange(count + 2)
     taking_part = {

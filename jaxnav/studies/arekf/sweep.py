@@ -64,11 +64,12 @@ def _run_one(setup: Setup, factors: tuple[float, ...]) -> Any:
 def _params(
     names: tuple[str, ...], factors: tuple[float, ...], flight: Run, shared: Shared
 ) -> BankParams:
-    members = replicate(FilterParams(shared.given, flight.start), len(names))
-    given = members.model
-    factor = jnp.asarray(factors, given.position_noise.dtype)[:, None]
-    noise = given._replace(
-        velocity_noise=factor * given.velocity_noise, position_noise=factor * given.position_noise
+    members = replicate(FilterParams(shared.believed, flight.start), len(names))
+    believed = members.model
+    factor = jnp.asarray(factors, believed.position_noise.dtype)[:, None]
+    noise = believed._replace(
+        velocity_noise=factor * believed.velocity_noise,
+        position_noise=factor * believed.position_noise,
     )
     index = jnp.arange(len(names))
     priors = {name: jnp.where(index == i, 0.0, -jnp.inf) for i, name in enumerate(names)}

@@ -83,7 +83,7 @@ def problem(config: ArekfConfig) -> Problem:
 
 
 def _parameters(shared: Shared) -> dict[str, Parameter]:
-    given, kernel = shared.given, shared.kernel
+    given, kernel = shared.believed, shared.kernel
     arw, vrw = given.gyro_noise / DEG_PER_SQRT_HOUR, given.accel_noise * HOUR**0.5
     return {
         "arw_deg_sqrt_h": Parameter(arw, POSITIVE, "angle random walk N, by axis [deg/sqrt(h)]"),
@@ -116,7 +116,7 @@ def _draw(timing: Timing, world: World, key: Array, runs: int) -> Flights:
 
 
 def _params(shared: Shared, values: Values, start: Gaussian) -> FilterParams:
-    noise = shared.given._replace(
+    noise = shared.believed._replace(
         gyro_noise=values["arw_deg_sqrt_h"] * DEG_PER_SQRT_HOUR,
         accel_noise=values["vrw_m_s_sqrt_h"] / HOUR**0.5,
     )
@@ -185,14 +185,14 @@ def _comparison(timing: Timing) -> Callable[[Array, Any], RunOutput]:
         del info
         return filter.estimate(state).mean.dcm
 
-    def one(key: Array, given: tuple[Shared, Values]) -> RunOutput:
-        shared, _ = given
+    def one(key: Array, arguments: tuple[Shared, Values]) -> RunOutput:
+        shared, _ = arguments
         flight = fly_run(key, shared.world, timing)
-        together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *_methods(flight, *given))
+        together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *_methods(flight, *arguments))
 
         def score(method: tuple[Array, Array, Versoria]) -> Array:
             gyro, accel, kernel = method
-            noise = shared.given._replace(gyro_noise=gyro, accel_noise=accel)
+            noise = shared.believed._replace(gyro_noise=gyro, accel_noise=accel)
             params = FilterParams(noise, flight.start, kernel)
             every = timing.steps_per_record
             seen = run(filter, params, flight.inputs, flight.fixes, record=dcm, every=every).record
@@ -213,7 +213,7 @@ def _methods(flight: Run, shared: Shared, values: Values) -> list[tuple[Array, A
     One of no width is the plain filter.
     """
     tuned = _params(shared, values, flight.start)
-    given, true, kernel = shared.given, shared.world.noise, shared.kernel
+    given, true, kernel = shared.believed, shared.world.noise, shared.kernel
     plain = kernel._replace(width=jnp.zeros_like(kernel.width))
     walks = {"given": given, "true": true}
     own = {name: (noise.gyro_noise, noise.accel_noise) for name, noise in walks.items()}

@@ -216,8 +216,8 @@ def _comparison(setup: Setup) -> Callable[[Array, Any], RunOutput]:
     single = ukf(model, alpha=setup.alpha, beta=setup.beta, kappa=setup.kappa)
     banks = panel(ukf(model), TUNED), panel(informed(single), UKF_RULES)
 
-    def one(key: Array, given: tuple[World, BankParams, BankParams]) -> RunOutput:
-        world, own, others = given
+    def one(key: Array, arguments: tuple[World, BankParams, BankParams]) -> RunOutput:
+        world, own, others = arguments
         flight = fly(key, world, setup.period, setup.imu_step, setup.star)
         count = own.members.sigma.spread.shape[0]
         initial = own.members.initial._replace(mean=replicate(flight.start, count))

@@ -133,8 +133,8 @@ def _comparison(setup: Setup) -> Callable[[Array, Any], RunOutput]:
     """Return the run of the optimum and its rivals as a function of its key and what runs share."""
     chosen = filters(setup)
 
-    def one(key: Array, given: tuple[Shared, Values]) -> RunOutput:
-        shared, values = given
+    def one(key: Array, arguments: tuple[Shared, Values]) -> RunOutput:
+        shared, values = arguments
         flight = fly_run(key, shared.world, setup.timing)
 
         def score(method: str, params: FilterParams) -> Array:

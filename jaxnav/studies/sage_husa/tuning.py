@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, float0
 
 from jaxnav.compiling import compiled
-from jaxnav.estimation.banks.mixture import BankParams, rewatch
+from jaxnav.estimation.banks.mixture import BankParams, reweighed
 from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import Floor, Penalty, chain, fixed, floor, penalty
 from jaxnav.estimation.filters.kalman import ekf
@@ -260,7 +260,9 @@ def _mean_square(rule: WeightRule, params: Any, log_prior: Array, watched: Watch
     silent = SureObs(jnp.zeros((steps, 0)), jnp.zeros((steps, 0), bool))
     own = BankParams((), params, log_prior)
     segment = max(1, round(steps**0.5))
-    weights = run(rewatch(rule), own, watched.info, silent, record=_told, segment=segment).record
+    weights = run(
+        reweighed(rule), own, watched.info, silent, record=_weights, segment=segment
+    ).record
     error = jnp.sum(jnp.exp(weights)[:, :, None] * watched.error, axis=1)
     return jnp.mean(error**2)
 
@@ -269,7 +271,7 @@ def _rmse(config: SageHusaConfig, smooth: bool, values: Values, drives: Run) -> 
     return rule_rmse(smooth, values, watch(config, smooth, values, drives))
 
 
-def _told(state: Any, log_weights: Array) -> Array:
+def _weights(state: Any, log_weights: Array) -> Array:
     del state
     return log_weights
 
@@ -288,8 +290,8 @@ def _comparison(config: SageHusaConfig) -> Callable[[Array, Any], RunOutput]:
     chosen = np.array(taking_part(config, tuple(RIVALS.values())))
     bayesian = {name: BANKS.get(name, fixed()) for name in RIVALS.values()}
 
-    def one(key: Array, given: tuple[Shared, Values]) -> RunOutput:
-        shared, values = given
+    def one(key: Array, arguments: tuple[Shared, Values]) -> RunOutput:
+        shared, values = arguments
         drive = drive_run(key, shared.world, clock_of(config))
         model, law = jax.tree.map(lambda leaf: leaf[chosen], shared.members)
         others = FilterParams(model, replicate(drive.start, chosen.size), law)
