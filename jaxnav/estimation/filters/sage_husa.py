@@ -184,8 +184,8 @@ def sage_husa(
         if current:
             inner, info = updated(noise)
         if form == "printed":
-            used = cholesky(mask_noise(noise if current else state.noise, obs.valid))
-            lost = ~used.positive_definite
+            applied = cholesky(mask_noise(noise if current else state.noise, obs.valid))
+            lost = ~applied.positive_definite
             info = info._replace(
                 flags=info.flags | jnp.where(lost, int(Flag.INDEFINITE), 0).astype(jnp.int32)
             )
