@@ -134,6 +134,8 @@ def _typed(flag: str, annotation: Annotation, words: Any) -> Any:
     """
     if NoneType in get_args(annotation.kind) and words in ("none", "None"):
         return None
+    if words == ["none"]:
+        return converted(flag, annotation.kind, [])
     if isinstance(words, list) and annotation.separator:
         words = [part.strip() for word in words for part in word.split(annotation.separator)]
         words = [word for word in words if word]
@@ -244,7 +246,9 @@ def _miscounted(flag: str, kinds: Mapping[str, Any]) -> str:
     kind = kinds.get(flag, bool)
     if kind is bool:
         return f"{flag} is given a value; it must stand alone, as {flag} or --no-{flag[2:]}"
-    return f"{flag} is given too few values; it must be {accepted(kind)}"
+    several = isinstance(_values(kind).get("nargs"), int)
+    few = "too few values" if several else "no value"
+    return f"{flag} is given {few}; it must be {accepted(kind)}"
 
 
 class _Formatter(argparse.HelpFormatter):
@@ -265,7 +269,7 @@ def _values(kind: Any) -> dict[str, Any]:
     if get_origin(kind) is tuple:
         parts = get_args(kind)
         variadic = parts[-1] is Ellipsis
-        return {"metavar": _METAVARS[parts[0]], "nargs": "*" if variadic else len(parts)}
+        return {"metavar": _METAVARS[parts[0]], "nargs": "+" if variadic else len(parts)}
     return {"metavar": _METAVARS[kind]}
 
 

@@ -166,7 +166,7 @@ def test_a_file_says_what_flags_say(name: str, write: Callable[..., Path]) -> No
 
 
 def test_flags_take_numbers_below_zero_lists_and_none(write: Callable[..., Path]) -> None:
-    path = write("rate_hz = 20", "gate = false", name="bank.toml")
+    path = write("rate_hz = 20", "gate = false", "carry = ['time-offset']", name="bank.toml")
     flags = "--axle-m -1e-3 2 -.5 --time-offset-s=-1e-2 --carry lever-arm,mounting --carry=mounting"
     parsed = parse_filter([*flags.split(), "--rate-hz", "none", "--config", str(path)])
     assert parsed is not None
@@ -179,6 +179,9 @@ def test_flags_take_numbers_below_zero_lists_and_none(write: Callable[..., Path]
     )
     assert parsed.config == expected
     assert (parsed.out, parsed.json, parsed.cache) == (Path("results/filter"), False, True)
+    parsed = parse_filter(["--config", str(path), "--carry", "none"])
+    assert parsed is not None
+    assert parsed.config.carry == ()
     parsed = parse_allan(["--out", "there", "--json", "--no-cache", "--end-s", "9"])
     assert parsed is not None
     assert parsed.config == AllanConfig(end_s=9.0)
@@ -206,12 +209,24 @@ def test_a_fault_of_a_file_names_file_and_key(case: str, write: Callable[..., Pa
 
 FLAGS = {
     "a slip": ("--confidense 0.9", "there is no flag '--confidense', did you mean '--confidence';"),
-    "no value": ("--confidence", "--confidence is given too few values; it must be a number"),
+    "no value": ("--confidence", "--confidence is given no value; it must be a number"),
     "two values": ("--confidence 0.9 0.8", "'0.8' belongs to no flag; `jaxnav allan LOG --help`"),
     "a value for a switch": ("--json=3", "--json is given a value; it must stand alone, as --json"),
     "part of a flag": ("--conf 0.9", "there is no flag '--conf'"),
     "of several at once": ("--start-s 9 --end-s 3", "--end-s is 3.0; it must be after start_s"),
 }
+
+
+def test_a_list_without_entries_is_no_default() -> None:
+    """``--params`` alone would tune all of them."""
+    kind = STUDIES["immae"].load("config")
+    for flags, sentence in (
+        (["--params"], "--params is given no value; it must be a list of texts"),
+        (["--study.theta", "--steps", "3"], "--study.theta is given no value; it must be a list"),
+        (["--study.initial-misalignment-arcsec", "1"], "is given too few values; it must be three"),
+    ):
+        with pytest.raises(ConfigError, match=sentence):
+            parse_tune("immae", kind, flags)
 
 
 @pytest.mark.parametrize("case", FLAGS)
