@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.compiling import compiled, cores
-from jaxnav.estimation.checks import described
+from jaxnav.given import described
 
 TILE = 8
 """Number of runs in a tile on a CPU: few are then filled up in vain, the working set of a bank of

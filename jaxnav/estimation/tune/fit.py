@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxnav.compiling import compiled
 from jaxnav.estimation.tune.transforms import POSITIVE, Coordinates, coordinates
+from jaxnav.given import require_whole
 
 Progress = Callable[[int, int, float], None]
 
@@ -103,8 +104,7 @@ def fit(
         ValueError: If a starting value is outside its domain, or ``steps`` below 1.
         StartError: A ``ValueError``, if the loss there is not finite.
     """
-    if not isinstance(steps, int | np.integer) or steps < 1:
-        raise ValueError(f"steps is {steps}; a fit needs a whole number of at least 1")
+    require_whole("steps", steps, 1)
     free = coordinates(start, transform)
     given = (lambda number: data) if batches is None else (lambda number: (batches(number),))
     evaluate = _evaluation(loss, free, given, mode)
