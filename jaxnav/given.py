@@ -75,6 +75,16 @@ def require_array(name: str, value: Any) -> Any:
     return value
 
 
+def as_array(name: str, value: Any) -> jax.Array:
+    """Return numbers as an array, or raise ``ValueError`` for what has none."""
+    try:
+        return jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} is {described(value)}; it must be a number, an array or rows of one length"
+        ) from None
+
+
 def require_floating(name: str, value: Any) -> Any:
     """Return an array of floating-point numbers, or raise ``ValueError``."""
     array = require_array(name, value)
