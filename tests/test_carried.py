@@ -221,7 +221,10 @@ MISUSE: dict[str, tuple[Callable[[], object], str]] = {
         "'a b' cannot be the name",
     ),
     "taken": (lambda: carrying(OWN, {"own": constant(1)}, period=1.0), "'own' cannot be the name"),
-    "no size": (lambda: carrying(OWN, {"a": constant(0)}, period=1.0), "has the size 0"),
+    "no size": (
+        lambda: carrying(OWN, {"a": constant(0)}, period=1.0),
+        "'a' is 0; it must be",
+    ),
     "nearly": (
         lambda: sins_gnss.sins_gnss(carry={"leverarm": constant(3)}),
         "did you mean 'lever_arm'",
@@ -284,7 +287,7 @@ MISUSE: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "a negative period": (
         lambda: carrying(OWN, {"bias": constant(1)}, period=-1.0),
-        "period is -1.0; it must be zero or more",
+        "period is -1; it must be in [0, inf]",
     ),
     "a list to carry": (
         lambda: sins_gnss.sins_gnss(carry=["lever_arm"]),  # pyright: ignore[reportArgumentType]

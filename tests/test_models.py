@@ -91,7 +91,7 @@ MISUSE = {
     ),
     "a filter for a process": (
         lambda: observing(ekf(WHOLE), {"a": LINE}),  # pyright: ignore[reportArgumentType]
-        "process is Filter; observing takes a Process, or a Model",
+        "process is a Filter; observing takes a Process, or a Model",
     ),
     "a model to be measured": (
         lambda: measured(jax.random.key(0), NOT_ONE, (), jnp.ones((3, 2)), None),
@@ -104,8 +104,11 @@ MISUSE = {
     "no channel": (lambda: observing(PROCESS), "there is no channel"),
     "two of one name": (lambda: observing(PROCESS, {"a": LINE}, {"a": BENT}), "two channels 'a'"),
     "the name of the process": (lambda: observing(PROCESS, {"process": LINE}), "named 'process'"),
-    "no size": (lambda: observing(PROCESS, {"a": LINE._replace(size=0)}), "it must be 1 or more"),
-    "no Channel": (lambda: observing(PROCESS, {"a": NOT_ONE}), "'a' is Process, not a Channel"),
+    "no size": (lambda: observing(PROCESS, {"a": LINE._replace(size=0)}), "it must be at least 1"),
+    "no Channel": (
+        lambda: observing(PROCESS, {"a": NOT_ONE}),
+        "it must be a Channel",
+    ),
     "unknown name": (lambda: WHOLE.channel("lime"), "did you mean 'line'"),
     "no values": (lambda: WHOLE.stack({}), "no values to stack"),
     "values of another size": (

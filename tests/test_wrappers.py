@@ -247,7 +247,7 @@ MISUSE: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "half an iteration": (
         lambda: versoria(ekf(MODEL), iterations=WRONG / 2),
-        r"^iterations is 1\.5; a robust update needs 1 or more, and whole$",
+        r"^iterations is 1\.5; it must be at least 1, and whole$",
     ),
     "a builder without its model": (
         lambda: sage_husa(ekf),

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.estimation.checks import require_filter, require_model
 from jaxnav.estimation.filters.innovation import masked_innovation
 from jaxnav.estimation.filters.kalman import KalmanState, ekf
 from jaxnav.estimation.types import (
@@ -20,6 +21,7 @@ from jaxnav.estimation.types import (
     Point,
     accept,
 )
+from jaxnav.given import described, require_function
 from jaxnav.numerics.linalg import matmul
 
 
@@ -36,15 +38,35 @@ def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filte
     Returns:
         A filter with the same parameters and state.
     """
+    require_filter(filter)
+    require_function("informed", informed, "params", "u")
+    single = filter.on is not None
+
+    def told(params: Params, u: Input) -> Params:
+        found = informed(params, u)
+        if single and not isinstance(found, FilterParams):
+            raise ValueError(
+                f"informed returns {described(found)}; it must return the filter's parameters, "
+                "FilterParams(model, initial)"
+            )
+        return found
+
+    def init(params: Params) -> Any:
+        if single and not hasattr(params, "initial"):
+            raise ValueError(
+                f"params is {described(params)}; an oracle's has the filter's prior, as "
+                "FilterParams(model, initial)"
+            )
+        return filter.init(params)
 
     def predict(params: Params, state: Any, u: Input) -> Any:
-        return filter.predict(informed(params, u), state, u)
+        return filter.predict(told(params, u), state, u)
 
     def update(params: Params, state: Any, u: Input, obs: Obs) -> tuple[Any, Any]:
-        return filter.update(informed(params, u), state, u, obs)
+        return filter.update(told(params, u), state, u, obs)
 
     # What is told may be of any kind: the parameters need no more than the filter's prior.
-    return filter._replace(predict=predict, update=update, check=accept)
+    return filter._replace(init=init, predict=predict, update=update, check=accept)
 
 
 def linearised_at_truth(model: Model, truth: Callable[[Input], tuple[Point, Point]]) -> Filter:
@@ -64,13 +86,25 @@ def linearised_at_truth(model: Model, truth: Callable[[Input], tuple[Point, Poin
         Taylor (1979), IEEE Trans. Automatic Control 24(2); Tichavsky, Muravchik, Nehorai (1998),
         IEEE Trans. Signal Processing 46(5).
     """
+    require_model(model)
+    require_function("truth", truth, "u")
+
+    def known(u: Input) -> tuple[Point, Point]:
+        pair = truth(u)
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            found = f"{len(pair)} values" if isinstance(pair, tuple | list) else described(pair)
+            raise ValueError(
+                f"truth returns {found}; it must return two states, at the start and at the end of "
+                "the step"
+            )
+        return pair[0], pair[1]
 
     def moved(params: Params, dx: Array, u: Input) -> Array:
-        before, after = truth(u)
+        before, after = known(u)
         return model.local(after, model.transition(params, model.retract(before, dx), u))
 
     def seen(params: Params, dx: Array, u: Input) -> Array:
-        _, after = truth(u)
+        _, after = known(u)
         z = model.observe(params, after, u)
         return model.residual(model.observe(params, model.retract(after, dx), u), z)
 
@@ -89,22 +123,25 @@ def linearised_at_truth(model: Model, truth: Callable[[Input], tuple[Point, Poin
     errors = ekf(
         Model(
             transition,
-            lambda params, dx, u: model.process_noise(params, truth(u)[0], u),
+            lambda params, dx, u: model.process_noise(params, known(u)[0], u),
             observe,
-            lambda params, dx, u: model.observation_noise(params, truth(u)[1], u),
+            lambda params, dx, u: model.observation_noise(params, known(u)[1], u),
             jacobians=jacobians,
         )
     )
 
     def predict(params: FilterParams, state: KalmanState, u: Input) -> KalmanState:
-        before, after = truth(u)
+        before, after = known(u)
+        own, given = (jax.tree.map(jnp.shape, point) for point in (state.x, before))
+        if own != given:
+            raise ValueError(f"truth returns states {given}; they must be {own}, as the filter's")
         error = errors.predict(params, state._replace(x=model.local(before, state.x)), u)
         return error._replace(x=model.retract(after, error.x))
 
     def update(
         params: FilterParams, state: KalmanState, u: Input, obs: Obs
     ) -> tuple[KalmanState, Info]:
-        _, after = truth(u)
+        _, after = known(u)
         nu = masked_innovation(model, obs, model.observe(params.model, after, u))
         at = state._replace(x=model.local(after, state.x))
         error, info = errors.update(params, at, u, obs._replace(z=nu))

@@ -16,10 +16,22 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from jaxnav.estimation.checks import require_covariance
 from jaxnav.estimation.models import PROCESS, Differential, Process
 from jaxnav.estimation.types import Gaussian, Input, Params, Point
+from jaxnav.given import (
+    as_array,
+    described,
+    known,
+    require_array,
+    require_function,
+    require_number,
+    require_real,
+    require_whole,
+)
 
 
 class Carried(NamedTuple):
@@ -133,12 +145,16 @@ def carrying(
     """
     if not isinstance(process, Process):
         raise ValueError(
-            f"process is {type(process).__name__}; carrying takes a Process, of a model "
+            f"process is {described(process)}; carrying takes a Process, of a model "
             "process_of(model)"
         )
     _check_names(process, states)
-    if not callable(period) and not period >= 0:
-        raise ValueError(f"period is {period}; it must be zero or more")
+    if callable(period):
+        require_function("period", period, "u")
+    else:
+        require_number("period", period, "[0, inf]", 0, jnp.inf)
+    if inputs is not None:
+        require_function("inputs", inputs, "carried", "u")
     # As a tree of JAX has them: then no order in which they are named can be a wrong one.
     states = dict(sorted(states.items()))
     total = sum(law.size for law in states.values())
@@ -230,8 +246,20 @@ def with_carried(initial: Gaussian, states: Mapping[str, tuple[Array, Array]]) -
             name.
 
     Raises:
-        ValueError: If a mean is no vector, or its variance has another size.
+        ValueError: If a mean is no vector, its variance has another size, or either is no such.
     """
+    if not isinstance(initial, Gaussian):
+        raise ValueError(f"initial is {described(initial)}; it must be Gaussian(mean, cov)")
+    require_array("the initial covariance", initial.cov)
+    if not isinstance(states, Mapping):
+        raise ValueError(
+            f"states is {described(states)}; it must be a mapping of names to (mean, variance)"
+        )
+    for name, entry in states.items():
+        if not isinstance(entry, tuple | list) or len(entry) != 2:
+            raise ValueError(
+                f"{name!r} of states is {described(entry)}; it must be (mean, variance)"
+            )
     states = {name: _known_before(name, *entry) for name, entry in sorted(states.items())}
     wide = [cov if jnp.ndim(cov) == 2 else jnp.diag(cov) for _, cov in states.values()]
     mean = Carried(initial.mean, {name: value for name, (value, _) in states.items()})
@@ -275,7 +303,8 @@ def carried_or(x: Any, name: str, size: int, default: Any) -> Any:
 
 
 def _known_before(name: str, mean: Any, variance: Any) -> tuple[Array, Array]:
-    mean, variance = _floating(mean), _floating(variance)
+    mean = _floating(f"the mean of {name!r}", mean)
+    variance = _floating(f"the variance of {name!r}", variance)
     k = mean.shape[0] if mean.ndim == 1 else 0
     if k == 0:
         raise ValueError(f"the mean of {name!r} is {mean.shape}; it must be (k,)")
@@ -283,12 +312,17 @@ def _known_before(name: str, mean: Any, variance: Any) -> tuple[Array, Array]:
         raise ValueError(
             f"the variance of {name!r} is {variance.shape}; it must be ({k},) or ({k}, {k})"
         )
+    spread = known(variance)
+    if spread is not None:
+        cov = np.diag(spread) if spread.ndim == 1 else spread
+        require_covariance(f"the variance of {name!r}", cov)
     return mean, variance
 
 
-def _floating(value: Any) -> Array:
+def _floating(name: str, value: Any) -> Array:
     """Return an array in the precision that it has, whole numbers in the usual one."""
-    array = jnp.asarray(value)
+    array = as_array(name, value)
+    require_real(name, array)
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
@@ -302,7 +336,7 @@ def _fields_of(x: Any) -> set[str]:
 def _check_params(params: Any, states: Mapping[str, Law]) -> None:
     if not isinstance(params, CarriedParams):
         raise ValueError(
-            f"the parameters are {type(params).__name__}; a process that carries states takes "
+            f"the parameters are {described(params)}; a process that carries states takes "
             "CarriedParams(own, {name: parameters of its law})"
         )
     for name in states:
@@ -316,7 +350,7 @@ def _check_params(params: Any, states: Mapping[str, Law]) -> None:
 def _check_state(x: Any, states: Mapping[str, Law]) -> None:
     if not isinstance(x, Carried):
         raise ValueError(
-            f"the state is {type(x).__name__}; one that carries {', '.join(states)} is "
+            f"the state is {described(x)}; one that carries {', '.join(states)} is "
             "Carried(own, {name: state}), as with_carried makes the initial one"
         )
     for name, law in states.items():
@@ -331,17 +365,25 @@ def _check_state(x: Any, states: Mapping[str, Law]) -> None:
 
 def _check_names(process: Process, states: Mapping[str, Law]) -> None:
     before = {name for name, _ in process.carried}
-    if not states or not isinstance(states, Mapping):
+    if not isinstance(states, Mapping):
+        raise ValueError(f"states is {described(states)}; it must be a mapping of names to laws")
+    if not states:
         raise ValueError("there is no state to carry; name one or more, with its law")
     for name, law in states.items():
         if not isinstance(law, Law):
-            raise ValueError(f"the law of {name!r} is {law!r}; it must be a Law, as constant(3) is")
+            raise ValueError(
+                f"the law of {name!r} is {described(law)}; it must be a Law, as constant(3) is"
+            )
         if name in before:
             raise ValueError(f"the state {name!r} is carried twice; carry each once")
-        if not name.isidentifier() or keyword.iskeyword(name) or hasattr(Carried, name):
+        if (
+            not isinstance(name, str)
+            or not name.isidentifier()
+            or keyword.iskeyword(name)
+            or hasattr(Carried, name)
+        ):
             raise ValueError(f"{name!r} cannot be the name of a carried state; take an attribute's")
-        if not isinstance(law.size, int) or law.size < 1:
-            raise ValueError(f"the carried state {name!r} has the size {law.size}; it must be >= 1")
+        require_whole(f"the size of the carried state {name!r}", law.size, 1)
 
 
 def _by_carried(

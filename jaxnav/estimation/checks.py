@@ -1,7 +1,8 @@
 """What a caller hands over, held against what is accepted, in the words of the caller.
 
 Types and shapes are looked at always, values where they are concrete: under ``jit``, ``vmap`` and
-``grad`` they are not, and what is wrong with them then shows in :class:`Flag`.
+``grad`` they are not, and what is wrong with them then shows in :class:`Flag`. What needs neither
+filter nor model is in :mod:`jaxnav.given`.
 """
 
 from collections.abc import Mapping
@@ -13,36 +14,21 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Model, Obs
+from jaxnav.given import (
+    Domain,
+    described,
+    known,
+    require_array,
+    require_floating,
+    require_function,
+    require_number,
+    require_real,
+)
 
 SUM_TOLERANCE = 1e-6
 """How far from one probabilities may sum: rounding, and matrices kept in float32."""
 ROUNDING = 1e-6
 """Relative asymmetry, and share of the variances by which an eigenvalue may be negative."""
-
-
-Domain = tuple[str, float, float]
-POSITIVE: Domain = ("(0, inf]", 0.0, np.inf)
-NOT_NEGATIVE: Domain = ("[0, inf)", 0.0, np.inf)
-"""Domains of :func:`require_number`: an interval in words, its lower and its upper end."""
-
-
-def described(value: Any) -> str:
-    """Return what a value is, for a message: an array by its shape and type, others by class."""
-    if isinstance(value, jax.Array | np.ndarray | np.generic):
-        return f"an array {np.shape(value)} of {value.dtype}"
-    if isinstance(value, bool | int | float | str | type(None)):
-        return repr(value)
-    if value == ():
-        return "()"
-    if isinstance(value, type) or (callable(value) and hasattr(value, "__name__")):
-        return f"the {'class' if isinstance(value, type) else 'function'} {value.__name__}"
-    name = type(value).__name__
-    return f"{'an' if name[0] in 'AEIOaeio' else 'a'} {name}"
-
-
-def known(value: Any) -> np.ndarray | None:
-    """Return a value as an array if it is concrete, or ``None``."""
-    return None if isinstance(value, Tracer | jax.ShapeDtypeStruct) else np.asarray(value)
 
 
 def require_filter(filter: Any) -> None:
@@ -54,6 +40,36 @@ def require_filter(filter: Any) -> None:
         )
 
 
+def require_model(model: Any) -> None:
+    """Raise ``ValueError`` unless it is a model, made of functions."""
+    if not isinstance(model, Model):
+        raise ValueError(
+            f"model is {described(model)}; it must be a Model, as jaxnav.Model(transition, "
+            "process_noise, observe, observation_noise) or jaxnav.observing make it"
+        )
+    for name in ("transition", "process_noise", "observe", "observation_noise"):
+        require_function(f"{name} of the model", getattr(model, name), "params", "x", "u")
+
+
+def require_steps(**given: Any) -> int:
+    """Return the length of the leading time axis that pytrees share, or raise ``ValueError``."""
+    steps = set()
+    for name, tree in given.items():
+        for leaf in jax.tree.leaves(tree):
+            if not np.shape(leaf):
+                raise ValueError(
+                    f"{name} has {described(leaf)} in it; every leaf needs a leading time axis"
+                )
+            steps.add(np.shape(leaf)[0])
+    if len(steps) != 1:
+        *first, last = given
+        raise ValueError(
+            f"{', '.join(first)} and {last} have {sorted(steps)} steps; every leaf needs the same "
+            "leading time axis"
+        )
+    return steps.pop()
+
+
 def require_observations(observations: Any) -> None:
     """Raise ``ValueError`` unless it is an :class:`Obs` of a run, ``(T, m)`` twice."""
     if not isinstance(observations, Obs):
@@ -61,11 +77,14 @@ def require_observations(observations: Any) -> None:
             f"observations is {described(observations)}; it must be Obs(z, valid), which "
             "jaxnav.observed(z) makes of an array"
         )
-    z, valid = (_array(f"observations.{name}", getattr(observations, name)) for name in Obs._fields)
+    z, valid = (
+        require_array(f"observations.{name}", getattr(observations, name)) for name in Obs._fields
+    )
     if z.ndim != 2 or valid.shape != z.shape:
         raise ValueError(
             f"observations has z {z.shape} and valid {valid.shape}; both must be (T, m)"
         )
+    require_real("observations.z", z)
     if valid.dtype != bool:
         raise ValueError(f"observations.valid is of {valid.dtype}; it must be of bool")
 
@@ -97,8 +116,8 @@ def require_prior(model: Model, initial: Any) -> None:
         raise ValueError(f"initial is {described(initial)}; it must be Gaussian(mean, cov)")
     leaves = jax.tree.leaves(initial.mean, is_leaf=lambda node: isinstance(node, list))
     for leaf in leaves:
-        _floating("the initial mean", leaf)
-    cov = _floating("the initial covariance", initial.cov)
+        require_floating("the initial mean", leaf)
+    cov = require_floating("the initial covariance", initial.cov)
     tangent = jax.eval_shape(model.local, initial.mean, initial.mean).shape
     if len(tangent) != 1:
         raise ValueError(
@@ -201,27 +220,6 @@ def require_log_prior(log_prior: Any, count: int) -> None:
         )
 
 
-def require_number(name: str, value: Any, domain: str, low: float, high: float) -> None:
-    """Raise ``ValueError`` unless a value is one number within a domain.
-
-    Args:
-        name: Of the value, for the message.
-        value: The value.
-        domain: The domain as an interval, for the message; a round bracket leaves the end out.
-        low: Its lower end.
-        high: Its upper end.
-    """
-    if not _is_number(value):
-        raise ValueError(f"{name} is {described(value)}; it must be a number in {domain}")
-    given = known(value)
-    if given is None:
-        return
-    above = given > low if domain.startswith("(") else given >= low
-    below = given < high if domain.endswith(")") else given <= high
-    if not (above and below):
-        raise ValueError(f"{name} is {given:g}; it must be in {domain}")
-
-
 def require_fields(name: str, value: Any, kind: type, domains: Mapping[str, Domain]) -> None:
     """Raise ``ValueError`` unless a value is of a class and its fields are within their domains.
 
@@ -285,26 +283,3 @@ def require_transition_matrix(matrix: Any, count: int) -> None:
         raise ValueError(
             f"row {worst} of the transition matrix sums to {sums[worst]:g}; each must sum to 1"
         )
-
-
-def _is_number(value: Any) -> bool:
-    if isinstance(value, bool | str) or not isinstance(
-        value, int | float | np.generic | np.ndarray | jax.Array | jax.ShapeDtypeStruct
-    ):
-        return False
-    return np.shape(value) == ()
-
-
-def _array(name: str, value: Any) -> Any:
-    if not isinstance(value, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
-        raise ValueError(f"{name} is {described(value)}; it must be an array")
-    return value
-
-
-def _floating(name: str, value: Any) -> Any:
-    array = _array(name, value)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        raise ValueError(
-            f"{name} is of {array.dtype}; it must be of floating-point numbers, as float64"
-        )
-    return array

@@ -27,6 +27,7 @@ from jaxnav.estimation.types import (
     difference,
     subtract,
 )
+from jaxnav.given import described, require_function, require_whole
 
 PROCESS = "process"
 """What a model's parameters of its process go by; no channel can have this name."""
@@ -98,11 +99,16 @@ def by_name(params: Params, name: str) -> Params:
     """
     if not isinstance(params, ModelParams):
         raise ValueError(
-            f"the model's parameters are {type(params).__name__}; a model that was put together "
+            f"the model's parameters are {described(params)}; a model that was put together "
             "takes ModelParams(process, {channel: its parameters})"
         )
     if name == PROCESS:
         return params.process
+    if not isinstance(params.channels, Mapping):
+        raise ValueError(
+            f"channels of ModelParams is {described(params.channels)}; it must be a mapping of "
+            "names to parameters"
+        )
     if name not in params.channels:
         raise ValueError(f"the model's parameters have none of channel {name!r}")
     return params.channels[name]
@@ -166,9 +172,15 @@ def observing(
     """
     if not isinstance(process, Process | Model):
         raise ValueError(
-            f"process is {type(process).__name__}; observing takes a Process, or a Model to whose "
+            f"process is {described(process)}; observing takes a Process, or a Model to whose "
             "channels others are added"
         )
+    if isinstance(process, Model) and not process.channels:
+        raise ValueError(
+            "process is a Model whose channels have no names; observing takes a Process, as "
+            "process_of(model) is, or a Model of its own"
+        )
+    require_function("parts", parts, "params", "name")
     before: tuple[tuple[str, int], ...] = ()
     blocks: dict[str, Channel] = {}
     if isinstance(process, Model):
@@ -279,20 +291,22 @@ def _merged(channels: tuple[Mapping[str, Channel], ...], taken: set[str]) -> dic
     for several in channels:
         if not isinstance(several, Mapping):
             raise ValueError(
-                f"the channels are {type(several).__name__}; they must be a mapping of names to "
+                f"the channels are {described(several)}; they must be a mapping of names to "
                 "channels"
             )
         for name, channel in several.items():
             if not isinstance(channel, Channel):
-                raise ValueError(f"channel {name!r} is {type(channel).__name__}, not a Channel")
+                raise ValueError(f"channel {name!r} is {described(channel)}; it must be a Channel")
             if name in named or name in taken:
                 raise ValueError(f"there are two channels {name!r}; each needs a name of its own")
             if name == PROCESS:
                 raise ValueError(f"a channel is named {PROCESS!r}, as the process itself")
-            if channel.size < 1:
-                raise ValueError(
-                    f"channel {name!r} has the size {channel.size}; it must be 1 or more"
-                )
+            if not isinstance(name, str):
+                raise ValueError(f"the name of a channel is {described(name)}; it must be a string")
+            require_whole(f"the size of channel {name!r}", channel.size, 1)
+            for part in ("observe", "noise"):
+                function = getattr(channel, part)
+                require_function(f"{part} of channel {name!r}", function, "params", "x", "u")
             named[name] = channel
     if not named:
         raise ValueError("there is no channel; a model needs one or more")

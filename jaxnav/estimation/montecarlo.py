@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxnav.compiling import compiled, cores
-from jaxnav.estimation.checks import described
+from jaxnav.given import described, require_function, require_leaves, require_whole
 
 TILE = 8
 """Number of runs in a tile on a CPU: few are then filled up in vain, the working set of a bank of
@@ -93,10 +93,16 @@ def monte_carlo(
         The campaign.
 
     Raises:
-        ValueError: If ``runs``, ``tile`` or ``threads`` is not positive, there is no device, the
-            key is not one, or ``run_one`` returns something else than a :class:`RunOutput`.
+        ValueError: If an argument is not what it must be, there is no device, or ``run_one``
+            returns something else than a :class:`RunOutput`.
     """
+    require_function("run_one", run_one, "key", "shared")
     _require_key(key)
+    require_leaves("shared", shared)
+    if devices is not None and (isinstance(devices, str) or not isinstance(devices, Sequence)):
+        raise ValueError(f"devices is {described(devices)}; it must be a list of JAX's devices")
+    if progress is not None:
+        require_function("progress", progress, "done", "runs")
     chosen = list(jax.local_devices()[:1] if devices is None else devices)
     if not chosen:
         raise ValueError("devices is empty; a Monte Carlo study needs at least one")
@@ -106,8 +112,8 @@ def monte_carlo(
     if threads is None:
         threads = max(cores() // len(chosen), 1) if on_cpu else 1
     for name, value in (("runs", runs), ("tile", tile), ("threads", threads)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name} is {value}; it must be at least 1, and whole")
+        require_whole(name, value, 1)
+    require_whole("keep", keep, 0)
     most = np.iinfo(np.int32).max - tile
     if runs > most:
         raise ValueError(f"runs is {runs}; it must be at most {most}")
@@ -189,6 +195,8 @@ def _run_tile(
                 f"run_one returns {described(output)}; it must return RunOutput(row), with numbers "
                 "and small arrays as the row"
             )
+        for name, value in zip(RunOutput._fields, output, strict=True):
+            require_leaves(f"{name} of run_one", value)
         return output
 
     output = jax.vmap(one, in_axes=(0, None))(keys, shared)

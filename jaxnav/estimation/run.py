@@ -11,10 +11,16 @@ from jax.core import Tracer
 from jax.experimental import checkify
 
 from jaxnav.compiling import compiled
-from jaxnav.estimation.checks import require_filter, require_observations
+from jaxnav.estimation.checks import (
+    require_filter,
+    require_model,
+    require_observations,
+    require_steps,
+)
 from jaxnav.estimation.debugging import check_covariance, checking
 from jaxnav.estimation.models import disturbed
-from jaxnav.estimation.types import Filter, Input, Model, Obs, Params
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Input, Model, Obs, Params
+from jaxnav.given import described, require_array, require_function, require_switch, require_whole
 from jaxnav.numerics.conditioning import KEPT
 
 Recorder = Callable[[Any, Any], Any]
@@ -68,14 +74,13 @@ def run(
     require_filter(filter)
     require_observations(observations)
     filter.check(params)
-    steps = {leaf.shape[0] for leaf in jax.tree.leaves((inputs, observations))}
-    if len(steps) != 1:
-        raise ValueError(
-            f"inputs and observations have {sorted(steps)} steps; "
-            "every leaf needs the same leading time axis"
-        )
-    if every < 1 or min(steps) % every:
-        raise ValueError(f"every is {every}; {min(steps)} steps must be a multiple of it")
+    steps = require_steps(inputs=inputs, observations=observations)
+    every, segment = require_whole("every", every, 1), require_whole("segment", segment, 0)
+    if steps % every:
+        raise ValueError(f"every is {every}; {steps} steps must be a multiple of it")
+    if record is not None:
+        require_function("record", record, "state", "info")
+    require_switch("debug", debug)
     given = (params, inputs, observations)
     if debug:
         return _debugged(_checked(filter, record, every, segment), given)
@@ -187,11 +192,44 @@ def simulate(
     Returns:
         The states, leading axis ``T``, and the observations ``(T, m)``, not a number where noise
         cannot be added to them (:func:`~jaxnav.estimation.models.disturbed`).
+
+    Raises:
+        ValueError: If an argument is not what it must be, leading axes differ, or the noise of a
+            step has not the size of the state's tangent or of the observation.
     """
+    require_model(model)
+    if isinstance(params, FilterParams):
+        raise ValueError(
+            "params is a FilterParams; simulate takes those of the model, params.model"
+        )
+    listed = list | str | Gaussian
+    for leaf in jax.tree.leaves(start, is_leaf=lambda node: isinstance(node, listed)):
+        if isinstance(leaf, listed):
+            raise ValueError(f"start is {described(leaf)}; it must be a state, as an array (n,)")
+    require_array("process_noise", process_noise)
+    require_array("observation_noise", observation_noise)
+    require_steps(inputs=inputs, process_noise=process_noise, observation_noise=observation_noise)
 
     def step(x: Any, now: tuple[Input, Array, Array]) -> tuple[Any, tuple[Any, Array]]:
         u, w, v = now
-        x = model.retract(model.transition(params, x, u), w)
-        return x, (x, disturbed(model.residual, model.observe(params, x, u), v))
+        tangent = jax.eval_shape(model.local, x, x)
+        _require_shape("process_noise", w, tangent.shape)
+        moved = model.retract(model.transition(params, x, u), w)
+        before, after = _types_of(x), _types_of(moved)
+        if before != after:
+            raise ValueError(f"start is {before}; a step makes {after} of it, which must be alike")
+        z = model.observe(params, moved, u)
+        _require_shape("observation_noise", v, jnp.shape(z))
+        return moved, (moved, disturbed(model.residual, z, v))
 
     return jax.lax.scan(step, start, (inputs, process_noise, observation_noise))[1]
+
+
+def _require_shape(name: str, noise: Array, shape: tuple[int, ...]) -> None:
+    if noise.shape != shape:
+        raise ValueError(f"{name} is {noise.shape} in a step; by the model it must be {shape}")
+
+
+def _types_of(x: Any) -> str:
+    """Return shapes and kinds of a state's arrays, in words."""
+    return ", ".join(f"{jnp.shape(leaf)} of {jnp.result_type(leaf)}" for leaf in jax.tree.leaves(x))

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxnav.given import require_array, require_leaves, require_real, require_whole
 from jaxnav.numerics.linalg import normalised_square
 
 Vector = Float[Array, " n"]
@@ -244,6 +245,8 @@ class Model(NamedTuple):
         known = sum(size for _, size in self.channels) or None
         if channels is None and known is None:
             raise ValueError("the model's channels have no names; give their number, channels=m")
+        if channels is not None:
+            channels = require_whole("channels", channels, 1)
         if channels is not None and known is not None and channels != known:
             raise ValueError(f"channels is {channels}; those of the model have {known} values")
         return known or channels or 0
@@ -368,6 +371,7 @@ def observed(z: Array) -> Obs:
     data, so a batch of runs cannot share its covariance recursion; simulations that lose no data
     should build :class:`SureObs` with one mask for all runs.
     """
+    require_real("z", require_array("z", z))
     finite = jnp.isfinite(z)
     return Obs(jnp.where(finite, z, 0), finite)
 
@@ -377,6 +381,8 @@ def replicate(params: Params, count: int) -> Params:
 
     Leaves that are numbers or NumPy arrays stay with NumPy, which has nothing to compile.
     """
+    count = require_whole("count", count, 1)
+    require_leaves("params", params)
 
     def widened(leaf: Any) -> Any:
         by = jnp if isinstance(leaf, Array) else np

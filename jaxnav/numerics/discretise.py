@@ -19,6 +19,8 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from jaxnav.given import as_array
+
 DOUBLINGS, ORDER = 12, 10
 LARGEST = 0.25 * 2**DOUBLINGS
 """Largest ``|F| dt``, the row sum norm, for which the result is right to rounding."""
@@ -47,9 +49,8 @@ def discretise(F: ArrayLike, G: ArrayLike | None, Qc: ArrayLike, dt: ArrayLike) 
         ValueError: If shapes do not fit together, something is complex, or ``dt`` or a variance is
             known to be negative.
     """
-    given = {"F": jnp.asarray(F), "Qc": jnp.asarray(Qc), "dt": jnp.asarray(dt)}
-    if G is not None:
-        given["G"] = jnp.asarray(G)
+    known = {"F": F, "Qc": Qc, "dt": dt, **({} if G is None else {"G": G})}
+    given = {name: as_array(name, value) for name, value in known.items()}
     _require_real(given)
     # Whole numbers would make the fractions of a step zero.
     A = given["F"]
@@ -95,5 +96,5 @@ def _require_real(given: dict[str, Array]) -> None:
         raise ValueError(f"dt is {dt.shape}; it must be one number")
     variances = jnp.diag(Qc) if Qc.ndim == 2 else Qc
     for name, value in {"dt": dt, "a variance of Qc": variances}.items():
-        if not isinstance(value, Tracer) and value.size and float(jnp.min(value)) < 0:
+        if not isinstance(value, Tracer) and value.size and not float(jnp.min(value)) >= 0:
             raise ValueError(f"{name} is {float(jnp.min(value)):g}; it must not be negative")

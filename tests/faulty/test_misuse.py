@@ -294,7 +294,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "no steps of a fit": (
         lambda: jn.fit(lambda p: p**2, 1.0, steps=0),
-        r"^steps is 0; a fit needs a whole number of at least 1$",
+        r"^steps is 0; it must be at least 1, and whole$",
     ),
 }
 

@@ -15,8 +15,9 @@ from jaxnav.estimation.banks.mixture import (
     require_bank_params,
 )
 from jaxnav.estimation.banks.weights import bayes, switched
-from jaxnav.estimation.checks import require_log_prior, require_number, require_transition_matrix
-from jaxnav.estimation.types import Filter, Gaussian, Info, Input, Obs
+from jaxnav.estimation.checks import require_log_prior, require_members, require_transition_matrix
+from jaxnav.estimation.types import Filter, Gaussian, Info, Input, Obs, accept
+from jaxnav.given import require_number, require_whole
 
 
 def imm(filter: Filter) -> Filter:
@@ -75,11 +76,12 @@ def imm_params(members: Any, transition: Array, log_prior: Any = None) -> BankPa
         log_prior: As in :class:`BankParams`.
 
     Raises:
-        ValueError: If the matrix has another size, a negative entry, or a row that does not sum to
-            one.
+        ValueError: If the members have no common model axis, or the matrix has another size, a
+            negative entry, or a row that does not sum to one.
     """
-    count = jax.tree.leaves(members)[0].shape[0]
+    count = require_members(accept, members)
     require_transition_matrix(transition, count)
+    require_log_prior(log_prior, count)
     return BankParams(members, transition, log_prior)
 
 
@@ -93,6 +95,7 @@ def uniform_switching(count: int, probability: Array | float) -> Array:
     Raises:
         ValueError: If a concrete probability is outside its domain.
     """
+    count = require_whole("count", count, 1)
     require_number("the probability to leave a model", probability, "[0, 1]", 0, 1)
     away = probability / max(count - 1, 1)
     stay = 1 - probability if count > 1 else 1.0

@@ -13,9 +13,9 @@ from jax import Array
 
 from jaxnav.estimation.banks.log_weights import active, member_log_likelihood, normalise
 from jaxnav.estimation.banks.reset import windowed_reset
-from jaxnav.estimation.banks.rule import WeightRule
+from jaxnav.estimation.banks.rule import WeightRule, require_rule
 from jaxnav.estimation.banks.weights import bayes, chain
-from jaxnav.estimation.checks import described, require_log_prior, require_members
+from jaxnav.estimation.checks import require_filter, require_log_prior, require_members
 from jaxnav.estimation.types import (
     Filter,
     Flag,
@@ -27,6 +27,7 @@ from jaxnav.estimation.types import (
     flags_of,
     subtract,
 )
+from jaxnav.given import described
 from jaxnav.numerics.linalg import cholesky, solve_lower, symmetrise
 
 
@@ -70,6 +71,13 @@ def panel(filter: Filter, rules: Mapping[str, WeightRule]) -> Filter:
     :class:`Info` and ``estimate`` one of :class:`Gaussian`, by rule name. With ``fixed`` weights on
     one member, a single filter takes part in the comparison at no further cost.
     """
+    require_filter(filter)
+    if not isinstance(rules, Mapping) or not rules:
+        raise ValueError(
+            f"rules is {described(rules)}; it must be a mapping of names to one rule or more"
+        )
+    for name, rule in rules.items():
+        require_rule(f"rule {name!r}" if name else "rule", rule)
     names = tuple(rules)
     estimate_members = jax.vmap(filter.estimate)
 

@@ -9,8 +9,9 @@ from jax import Array
 from jaxnav.estimation.banks.log_weights import active, normalise, uniform
 from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes_step, stay
-from jaxnav.estimation.checks import POSITIVE, require_fields
+from jaxnav.estimation.checks import require_fields
 from jaxnav.estimation.types import Info
+from jaxnav.given import POSITIVE, require_switch
 
 
 class WindowedReset(NamedTuple):
@@ -47,6 +48,7 @@ def windowed_reset(*, smooth: bool = False) -> WeightRule:
         they can differ only if the second set starts anew every period whether or not the first is
         reset, which is what is done here. The paper gives neither period nor threshold.
     """
+    require_switch("smooth", smooth)
     return WeightRule(_window_init, stay, _smooth_reset if smooth else _hard_reset, _check_reset)
 
 

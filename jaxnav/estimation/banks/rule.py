@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 from jax import Array
 
 from jaxnav.estimation.types import Info, Params, accept
+from jaxnav.given import described
 
 
 class WeightPredict(Protocol):
@@ -42,3 +43,12 @@ class WeightRule(NamedTuple):
     predict: WeightPredict
     update: WeightUpdate
     check: Callable[[Params, int], None] = accept
+
+
+def require_rule(name: str, rule: Any) -> None:
+    """Raise ``ValueError`` unless it is a weight rule, and not what builds one."""
+    if not isinstance(rule, WeightRule):
+        raise ValueError(
+            f"{name} is {described(rule)}; it must be a WeightRule, as jaxnav.bayes() or "
+            "jaxnav.chain(jaxnav.bayes(), jaxnav.floor()) make it"
+        )

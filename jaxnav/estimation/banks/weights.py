@@ -10,6 +10,7 @@ those of the filters. The others are smooth as they are: bounds at the machine e
 logarithm finite and decide nothing.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,16 +23,10 @@ from jaxnav.estimation.banks.log_weights import (
     member_log_likelihood,
     normalise,
 )
-from jaxnav.estimation.banks.rule import WeightRule
-from jaxnav.estimation.checks import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    described,
-    require_fields,
-    require_number,
-    require_transition_matrix,
-)
+from jaxnav.estimation.banks.rule import WeightRule, require_rule
+from jaxnav.estimation.checks import require_fields, require_transition_matrix
 from jaxnav.estimation.types import Flag, Info
+from jaxnav.given import FINITE, NOT_NEGATIVE, POSITIVE, described, require_number, require_switch
 
 
 def _stateless(params: Any, log_weights: Array) -> tuple[()]:
@@ -54,7 +49,13 @@ def _ignore_data(
 
 def fixed() -> WeightRule:
     """Return the rule that keeps the prior weights: one member alone, or a constant mixture."""
-    return WeightRule(_stateless, stay, _ignore_data)
+    return WeightRule(_stateless, stay, _ignore_data, partial(_check_none, "fixed"))
+
+
+def _check_none(who: str, params: Any, count: int) -> None:
+    del count
+    if jax.tree.leaves(params):
+        raise ValueError(f"the parameter of {who} is {described(params)}; it must be (), for none")
 
 
 def bayes_step(log_weights: Array, info: Info) -> Array:
@@ -81,7 +82,7 @@ def bayes() -> WeightRule:
         del params, k
         return state, bayes_step(log_weights, info)
 
-    return WeightRule(_stateless, stay, update)
+    return WeightRule(_stateless, stay, update, partial(_check_none, "bayes"))
 
 
 class Penalty(NamedTuple):
@@ -147,6 +148,7 @@ def _check_penalty(params: Penalty, count: int) -> None:
     del count
     domains = {
         "scale": NOT_NEGATIVE,
+        "exponent": FINITE,
         "least": NOT_NEGATIVE,
         "normaliser": NOT_NEGATIVE,
         "memory": POSITIVE,
@@ -177,6 +179,7 @@ def floor(*, smooth: bool = False) -> WeightRule:
     References:
         Maybeck and Stevens (1991), IEEE Trans. AES 27(3).
     """
+    require_switch("smooth", smooth)
 
     def update(
         params: Any, state: Any, log_weights: Array, info: Info, k: Array
@@ -303,6 +306,8 @@ def switch() -> WeightRule:
 
 def chain(*rules: WeightRule) -> WeightRule:
     """Return the rules one after another; parameters and state are tuples, one entry a rule."""
+    for i, rule in enumerate(rules):
+        require_rule(f"rule {i} of a chain", rule)
 
     def init(params: tuple[Any, ...], log_weights: Array) -> tuple[Any, ...]:
         return tuple(rule.init(own, log_weights) for rule, own in zip(rules, params, strict=True))

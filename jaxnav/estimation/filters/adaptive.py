@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import POSITIVE, require_ordered
+from jaxnav.estimation.checks import require_ordered
 from jaxnav.estimation.filters.innovation import measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
@@ -17,6 +17,7 @@ from jaxnav.estimation.filters.wrapping import (
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
+from jaxnav.given import POSITIVE, require_switch
 
 LARGEST_RATIO = 10.0
 """Largest ratio of a squared innovation to its variance that counts."""
@@ -103,6 +104,7 @@ def innovation_adaptive(
         Mehra (1972), IEEE Trans. Automatic Control 17(5); Mohamed and Schwarz (1999), Journal of
         Geodesy 73(4); Ding, Wang, Rizos, Kinlyside (2007), Journal of Navigation 60(3).
     """
+    require_switch("smooth", smooth)
     inside = wrapped(filter, model, "innovation_adaptive")
     own_model = inside.model
     base = inside.on(with_given_noise(own_model))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxnav.estimation.checks import described, require_fields, require_filter
+from jaxnav.estimation.checks import require_fields, require_filter
 from jaxnav.estimation.filters.innovation import nis_of
 from jaxnav.estimation.filters.wrapping import parted, require_wrapper
 from jaxnav.estimation.types import (
@@ -22,6 +22,7 @@ from jaxnav.estimation.types import (
     Params,
     flags_of,
 )
+from jaxnav.given import described
 
 
 class Gate(NamedTuple):

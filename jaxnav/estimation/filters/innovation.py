@@ -13,6 +13,7 @@ from jax import Array
 from jaxnav.estimation.checks import ROUNDING
 from jaxnav.estimation.debugging import check_covariance
 from jaxnav.estimation.types import Flag, Info, Model, Obs, SureObs, flags_of
+from jaxnav.given import require_array
 from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
 from jaxnav.numerics.linalg import Cholesky, kernel, log_det, normalised_square, solve_lower
 from jaxnav.numerics.roots import semidefinite_root
@@ -58,6 +59,7 @@ def measured_with(R: Array, obs: Obs) -> Measurement:
         ValueError: If ``R`` has another size.
     """
     m = obs.valid.shape[0]
+    require_array("the model's observation noise", R)
     if R.shape not in ((m,), (m, m)):
         raise ValueError(
             f"the model's observation noise is {R.shape} and the observation has {m} channels; "
@@ -94,7 +96,7 @@ def masked_innovation(model: Model, obs: Obs, z_pred: Array) -> Array:
     Raises:
         ValueError: If the observation and the model's prediction of it differ in shape.
     """
-    require_channels(obs, z_pred.shape)
+    require_channels(obs, require_array("the model's observation", z_pred).shape)
     z = jnp.where(obs.valid, obs.z, z_pred)
     return jnp.where(obs.valid, model.residual(z, z_pred), 0)
 
@@ -114,7 +116,8 @@ def measurement_of(model: Model, params: Any, x: Any, u: Any, obs: Obs) -> Measu
     Raises:
         ValueError: If observation, model and noise do not fit together.
     """
-    require_channels(obs, jax.eval_shape(model.observe, params, x, u).shape)
+    seen = require_array("the model's observation", jax.eval_shape(model.observe, params, x, u))
+    require_channels(obs, seen.shape)
     return measured_with(model.observation_noise(params, x, u), obs)
 
 
@@ -159,6 +162,7 @@ def require_step(model: Model, x: Any, moved: Any, Q: Array) -> None:
             "it must keep the shape"
         )
     n = jax.eval_shape(model.local, x, moved).shape[0]
+    require_array("the process noise", Q)
     if Q.shape != (n, n):
         raise ValueError(f"the process noise is {Q.shape}; it must be ({n}, {n}), as the state")
     check_covariance("the process noise", lambda: Q)

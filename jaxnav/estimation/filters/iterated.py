@@ -50,6 +50,7 @@ from jaxnav.estimation.types import (
     Params,
     Point,
 )
+from jaxnav.given import described, require_switch, require_whole
 from jaxnav.numerics.linalg import (
     Cholesky,
     cholesky,
@@ -191,11 +192,11 @@ def _iterated(
     printed: bool,
     on: Callable[[Model], Filter],
 ) -> Filter:
-    if iterations < 1 or trials < 0:
-        raise ValueError(
-            f"iterations = {iterations}, trials = {trials}; an iterated filter needs at least one "
-            "iteration and no negative number of trials"
-        )
+    require_whole("iterations", iterations, 1)
+    require_whole("trials", trials, 0)
+    require_switch("printed", printed)
+    if not isinstance(search, Search | None):
+        raise ValueError(f"search is {described(search)}; it must be Search(...), or None")
     built_with = Search() if search is None else search
 
     def check(params: FilterParams) -> None:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.ad_checkpoint import checkpoint_name
 
-from jaxnav.estimation.checks import require_filter_params, require_prior
+from jaxnav.estimation.checks import require_filter_params, require_model, require_prior
 from jaxnav.estimation.filters.innovation import (
     innovation_info,
     is_covariance,
@@ -109,6 +109,7 @@ def ekf(model: Model) -> Filter:
         Zhao, Chen, He, Ge (2018), IEEE/CAA JAS 5(6), section II; Sola, Deray, Atchuthan (2018), A
         micro Lie theory for state estimation in robotics, section III.
     """
+    require_model(model)
     check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> KalmanState:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.interpreters import partial_eval
 
+from jaxnav.estimation.checks import require_model
 from jaxnav.estimation.types import Input, LinearMap, Model, Params, Point
 from jaxnav.numerics.linalg import matmul
 
@@ -59,6 +60,7 @@ def with_itself_as_jacobians(model: Model) -> Model:
         ValueError: If the model has slots that a linear filter does not use; in a run, if a
             derivative depends on the state (:func:`is_affine`).
     """
+    require_model(model)
     unused = ("retract", "local", "jacobians")
     own = [name for name in unused if getattr(model, name) is not Model._field_defaults[name]]
     if own:

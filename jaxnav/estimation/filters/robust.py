@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import NOT_NEGATIVE, POSITIVE, Domain
 from jaxnav.estimation.filters.innovation import masked_innovation, measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
@@ -31,6 +30,7 @@ from jaxnav.estimation.filters.wrapping import (
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
+from jaxnav.given import NOT_NEGATIVE, POSITIVE, Domain, require_whole
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower
 
 LEAST_WEIGHT = 1e-8
@@ -141,8 +141,7 @@ def _reweighted(
     The info is that of the plain update, so that its likelihood and NIS tell of the data as the
     model has them; flags of the reweighted updates are added.
     """
-    if not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations is {iterations}; a robust update needs 1 or more, and whole")
+    require_whole("iterations", iterations, 1)
     model = inside.model
     require_additive(model, "a robust filter")
     base = inside.on(with_given_noise(model))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import POSITIVE, require_ordered
+from jaxnav.estimation.checks import require_ordered
 from jaxnav.estimation.filters.adaptive import softly_clamped
 from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, measurement_of
 from jaxnav.estimation.filters.wrapping import (
@@ -29,6 +29,7 @@ from jaxnav.estimation.filters.wrapping import (
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
+from jaxnav.given import POSITIVE, require_switch
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower, symmetrise
 
 NoiseForm = Literal["clamped", "residual", "printed"]
@@ -132,6 +133,8 @@ def sage_husa(
     """
     if form not in FORMS:
         raise ValueError(f"form is {form!r}; it must be one of {', '.join(FORMS)}")
+    require_switch("current", current)
+    require_switch("smooth", smooth)
     if current and form == "residual":
         raise ValueError("the residual form knows the noise only after the update: current is off")
     inside = wrapped(filter, model, "sage_husa")
@@ -161,6 +164,10 @@ def sage_husa(
             own_model, params.model, base.estimate(state.inner).mean, u, obs
         )
         obs, nominal = measurement.obs, measurement.noise
+        if obs.z.shape != (width,):
+            raise ValueError(
+                f"channels is {width}; it must be {obs.z.shape[0]}, the values of the observation"
+            )
         root = cholesky(nominal)
         L, scalable = root.factor, root.positive_definite
 

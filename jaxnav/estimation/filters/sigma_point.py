@@ -13,7 +13,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import require_filter_params, require_own, require_prior
+from jaxnav.estimation.checks import (
+    require_filter_params,
+    require_model,
+    require_own,
+    require_prior,
+)
 from jaxnav.estimation.filters.cloud import (
     Cloud,
     centre_column,
@@ -44,6 +49,7 @@ from jaxnav.estimation.types import (
     Obs,
     Point,
 )
+from jaxnav.given import FINITE, require_number, require_switch
 from jaxnav.numerics.linalg import (
     cholesky,
     matmul,
@@ -129,7 +135,7 @@ def ukf(
         Zhao, Chen, He, Ge (2018), IEEE/CAA JAS 5(6), Eqs. (12)-(25), with the index of (14) and the
         weight after (22) put right; Hertzberg et al. (2013), Information Fusion 14(1).
     """
-    return _sigma_point(model, partial(unscented, alpha=alpha, beta=beta, kappa=kappa), redraw)
+    return _sigma_point(model, _unscented(alpha, beta, kappa), redraw)
 
 
 def ckf(model: Model, *, redraw: bool = True) -> Filter:
@@ -176,7 +182,7 @@ def square_root_ukf(
         van der Merwe and Wan (2001), The square-root unscented Kalman filter; the update is the
         array form of Arasaratnam and Haykin (2009), which needs no downdate for positive weights.
     """
-    return _square_root(model, partial(unscented, alpha=alpha, beta=beta, kappa=kappa))
+    return _square_root(model, _unscented(alpha, beta, kappa))
 
 
 def square_root_ckf(model: Model) -> Filter:
@@ -190,8 +196,17 @@ def square_root_ckf(model: Model) -> Filter:
     return _square_root(model, cubature)
 
 
+def _unscented(alpha: float, beta: float, kappa: float) -> RuleOf:
+    given = {"alpha": alpha, "beta": beta, "kappa": kappa}
+    for name, value in given.items():
+        require_number(name, value, *FINITE)
+    return partial(unscented, **given)
+
+
 def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
     """Return the filter in covariance form."""
+    require_model(model)
+    require_switch("redraw", redraw)
     check = partial(require_filter_params, model, own=SigmaRule)
 
     def init(params: FilterParams) -> SigmaPointState:
@@ -250,6 +265,7 @@ def _sigma_point(model: Model, rule_of: RuleOf, redraw: bool) -> Filter:
 
 def _square_root(model: Model, rule_of: RuleOf) -> Filter:
     """Return the filter in square-root form."""
+    require_model(model)
     check = partial(require_filter_params, model, own=SigmaRule)
 
     def init(params: FilterParams) -> SquareRootSigmaPointState:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxnav.estimation.checks import require_filter_params, require_prior
+from jaxnav.estimation.checks import require_filter_params, require_model, require_prior
 from jaxnav.estimation.filters.innovation import (
     innovation_info,
     is_covariance,
@@ -92,6 +92,7 @@ def square_root_ekf(model: Model) -> Filter:
     The maps ``Phi`` and ``H`` are those of :func:`~jaxnav.estimation.filters.kalman.ekf`. Range
     and rank of the gradients are as for the linear filter.
     """
+    require_model(model)
     check = partial(require_filter_params, model)
 
     def init(params: FilterParams) -> SquareRootState:

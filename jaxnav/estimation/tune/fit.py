@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxnav.compiling import compiled
 from jaxnav.estimation.tune.transforms import POSITIVE, Coordinates, coordinates
+from jaxnav.given import described, require_function, require_whole
 
 Progress = Callable[[int, int, float], None]
 
@@ -103,8 +104,20 @@ def fit(
         ValueError: If a starting value is outside its domain, or ``steps`` below 1.
         StartError: A ``ValueError``, if the loss there is not finite.
     """
-    if not isinstance(steps, int | np.integer) or steps < 1:
-        raise ValueError(f"steps is {steps}; a fit needs a whole number of at least 1")
+    require_function("loss", loss)
+    require_whole("steps", steps, 1)
+    if not isinstance(data, tuple | list):
+        raise ValueError(f"data is {described(data)}; it must be a tuple of what the loss is given")
+    if not isinstance(optimiser, optax.GradientTransformation | None):
+        raise ValueError(
+            f"optimiser is {described(optimiser)}; it must be one of optax, as optax.adam(0.1)"
+        )
+    if not isinstance(validation, Validation | None):
+        raise ValueError(f"validation is {described(validation)}; it must be Validation(...)")
+    if batches is not None:
+        require_function("batches", batches, "number")
+    if progress is not None:
+        require_function("progress", progress, "step", "steps", "loss")
     free = coordinates(start, transform)
     given = (lambda number: data) if batches is None else (lambda number: (batches(number),))
     evaluate = _evaluation(loss, free, given, mode)
@@ -174,7 +187,14 @@ def _evaluation(
     """Return the compiled loss and gradient at a point, on the data of an evaluation."""
 
     def at(point: Array, given: tuple[Any, ...]) -> Array:
-        return loss(free.constrain(point), *given)
+        value = loss(free.constrain(point), *given)
+        if not isinstance(value, float | Array | np.ndarray | np.generic) or not (
+            jnp.shape(value) == () and jnp.issubdtype(jnp.result_type(value), jnp.floating)
+        ):
+            raise ValueError(
+                f"loss returns {described(value)}; it must return one floating-point number"
+            )
+        return value
 
     graded = compiled(value_and_gradient(at, mode))
 

@@ -165,4 +165,9 @@ def negative_log_likelihood(
 
 def _log_likelihood(state: Any, info: Info) -> Array:
     del state
+    if isinstance(info, Mapping):
+        raise ValueError(
+            f"filter is a panel of {', '.join(info)}; it must be one filter or bank, which has one "
+            "likelihood"
+        )
     return info.log_likelihood

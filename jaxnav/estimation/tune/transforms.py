@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.given import described, require_leaves
 from jaxnav.numerics.linalg import cholesky
 
 
@@ -133,13 +134,14 @@ def coordinates(params: Any, transform: Any = POSITIVE) -> Coordinates:
     Raises:
         ValueError: If a value is outside its domain, or every parameter is fixed.
     """
+    require_leaves("start", params)
     leaves, structure = jax.tree.flatten_with_path(params)
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]
     values = [jnp.asarray(leaf, float) for _, leaf in leaves]
     if isinstance(transform, Transform):
         transforms = [transform] * len(values)
     else:
-        transforms = structure.flatten_up_to(transform)
+        transforms = _for_each(structure, transform)
     pieces = [
         _real(name, value, own) for name, value, own in zip(names, values, transforms, strict=True)
     ]
@@ -169,6 +171,20 @@ def coordinates(params: Any, transform: Any = POSITIVE) -> Coordinates:
         _labels(names, pieces),
         behind,
     )
+
+
+def _for_each(structure: Any, transform: Any) -> list[Transform]:
+    """Return the transforms of a pytree in the order of the parameters."""
+    try:
+        found = structure.flatten_up_to(transform)
+    except (KeyError, TypeError, ValueError):
+        found = [transform]
+    if not found or not all(isinstance(each, Transform) for each in found):
+        raise ValueError(
+            f"transform is {described(transform)}; it must be one Transform, or a tree of them "
+            "like start"
+        )
+    return found
 
 
 def _real(name: str, value: Array, transform: Transform) -> Array:
