@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import described, require_function
 from jaxnav.estimation.checks import require_filter, require_model
 from jaxnav.estimation.filters.innovation import masked_innovation
 from jaxnav.estimation.filters.kalman import KalmanState, ekf
@@ -21,7 +22,6 @@ from jaxnav.estimation.types import (
     Point,
     accept,
 )
-from jaxnav.given import described, require_function
 from jaxnav.numerics.linalg import matmul
 
 
@@ -42,7 +42,7 @@ def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filte
     require_function("informed", informed, "params", "u")
     single = filter.on is not None
 
-    def told(params: Params, u: Input) -> Params:
+    def parameters(params: Params, u: Input) -> Params:
         found = informed(params, u)
         if single and not isinstance(found, FilterParams):
             raise ValueError(
@@ -60,10 +60,10 @@ def oracle(filter: Filter, informed: Callable[[Params, Input], Params]) -> Filte
         return filter.init(params)
 
     def predict(params: Params, state: Any, u: Input) -> Any:
-        return filter.predict(told(params, u), state, u)
+        return filter.predict(parameters(params, u), state, u)
 
     def update(params: Params, state: Any, u: Input, obs: Obs) -> tuple[Any, Any]:
-        return filter.update(told(params, u), state, u, obs)
+        return filter.update(parameters(params, u), state, u, obs)
 
     # What is told may be of any kind: the parameters need no more than the filter's prior.
     return filter._replace(init=init, predict=predict, update=update, check=accept)

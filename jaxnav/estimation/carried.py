@@ -19,10 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxnav.estimation.checks import require_covariance
-from jaxnav.estimation.models import PROCESS, Differential, Process
-from jaxnav.estimation.types import Gaussian, Input, Params, Point
-from jaxnav.given import (
+from jaxnav.arguments import (
     as_array,
     described,
     known,
@@ -32,6 +29,9 @@ from jaxnav.given import (
     require_real,
     require_whole,
 )
+from jaxnav.estimation.checks import require_covariance
+from jaxnav.estimation.models import PROCESS, Differential, Process
+from jaxnav.estimation.types import Gaussian, Input, Params, Point
 
 
 class Carried(NamedTuple):

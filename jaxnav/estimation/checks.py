@@ -2,7 +2,7 @@
 
 Types and shapes are looked at always, values where they are concrete: under ``jit``, ``vmap`` and
 ``grad`` they are not, and what is wrong with them then shows in :class:`Flag`. What needs neither
-filter nor model is in :mod:`jaxnav.given`.
+filter nor model is in :mod:`jaxnav.arguments`.
 """
 
 from collections.abc import Mapping
@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Model, Obs
-from jaxnav.given import (
+from jaxnav.arguments import (
     Domain,
     described,
     known,
@@ -24,6 +23,7 @@ from jaxnav.given import (
     require_number,
     require_real,
 )
+from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Model, Obs
 
 SUM_TOLERANCE = 1e-6
 """How far from one probabilities may sum: rounding, and matrices kept in float32."""

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import described, require_function, require_whole
 from jaxnav.estimation.types import (
     Input,
     LinearMap,
@@ -27,7 +28,6 @@ from jaxnav.estimation.types import (
     difference,
     subtract,
 )
-from jaxnav.given import described, require_function, require_whole
 
 PROCESS = "process"
 """What a model's parameters of its process go by; no channel can have this name."""

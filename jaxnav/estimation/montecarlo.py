@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.arguments import described, require_function, require_leaves, require_whole
 from jaxnav.compiling import compiled, cores
-from jaxnav.given import described, require_function, require_leaves, require_whole
 
 TILE = 8
 """Number of runs in a tile on a CPU: few are then filled up in vain, the working set of a bank of

@@ -10,6 +10,13 @@ from jax import Array
 from jax.core import Tracer
 from jax.experimental import checkify
 
+from jaxnav.arguments import (
+    described,
+    require_array,
+    require_function,
+    require_switch,
+    require_whole,
+)
 from jaxnav.compiling import compiled
 from jaxnav.estimation.checks import (
     require_filter,
@@ -20,7 +27,6 @@ from jaxnav.estimation.checks import (
 from jaxnav.estimation.debugging import check_covariance, checking
 from jaxnav.estimation.models import disturbed
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Input, Model, Obs, Params
-from jaxnav.given import described, require_array, require_function, require_switch, require_whole
 from jaxnav.numerics.conditioning import KEPT
 
 Recorder = Callable[[Any, Any], Any]

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxnav.given import require_array, require_leaves, require_real, require_whole
+from jaxnav.arguments import require_array, require_leaves, require_real, require_whole
 from jaxnav.numerics.linalg import normalised_square
 
 Vector = Float[Array, " n"]

@@ -19,7 +19,7 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
-from jaxnav.given import as_array
+from jaxnav.arguments import as_array
 
 DOUBLINGS, ORDER = 12, 10
 LARGEST = 0.25 * 2**DOUBLINGS

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import require_number, require_whole
 from jaxnav.estimation.banks.log_weights import active
 from jaxnav.estimation.banks.mixture import (
     BankParams,
@@ -17,7 +18,6 @@ from jaxnav.estimation.banks.mixture import (
 from jaxnav.estimation.banks.weights import bayes, switched
 from jaxnav.estimation.checks import require_log_prior, require_members, require_transition_matrix
 from jaxnav.estimation.types import Filter, Gaussian, Info, Input, Obs, accept
-from jaxnav.given import require_number, require_whole
 
 
 def imm(filter: Filter) -> Filter:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import described
 from jaxnav.estimation.banks.log_weights import active, member_log_likelihood, normalise
 from jaxnav.estimation.banks.reset import windowed_reset
 from jaxnav.estimation.banks.rule import WeightRule, require_rule
@@ -27,7 +28,6 @@ from jaxnav.estimation.types import (
     flags_of,
     subtract,
 )
-from jaxnav.given import described
 from jaxnav.numerics.linalg import cholesky, solve_lower, symmetrise
 
 

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import POSITIVE, require_switch
 from jaxnav.estimation.banks.log_weights import active, normalise, uniform
 from jaxnav.estimation.banks.rule import WeightRule
 from jaxnav.estimation.banks.weights import bayes_step, stay
 from jaxnav.estimation.checks import require_fields
 from jaxnav.estimation.types import Info
-from jaxnav.given import POSITIVE, require_switch
 
 
 class WindowedReset(NamedTuple):

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
+from jaxnav.arguments import described
 from jaxnav.estimation.types import Info, Params, accept
-from jaxnav.given import described
 
 
 class WeightPredict(Protocol):

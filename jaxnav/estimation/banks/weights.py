@@ -17,6 +17,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import (
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    described,
+    require_number,
+    require_switch,
+)
 from jaxnav.estimation.banks.log_weights import (
     active,
     from_peak,
@@ -26,7 +34,6 @@ from jaxnav.estimation.banks.log_weights import (
 from jaxnav.estimation.banks.rule import WeightRule, require_rule
 from jaxnav.estimation.checks import require_fields, require_transition_matrix
 from jaxnav.estimation.types import Flag, Info
-from jaxnav.given import FINITE, NOT_NEGATIVE, POSITIVE, described, require_number, require_switch
 
 
 def _stateless(params: Any, log_weights: Array) -> tuple[()]:

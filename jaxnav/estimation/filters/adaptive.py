@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import POSITIVE, require_switch
 from jaxnav.estimation.checks import require_ordered
 from jaxnav.estimation.filters.innovation import measurement_of
 from jaxnav.estimation.filters.wrapping import (
@@ -17,7 +18,6 @@ from jaxnav.estimation.filters.wrapping import (
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Gaussian, Info, Input, Model, Obs
-from jaxnav.given import POSITIVE, require_switch
 
 LARGEST_RATIO = 10.0
 """Largest ratio of a squared innovation to its variance that counts."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.arguments import described
 from jaxnav.estimation.checks import require_fields, require_filter
 from jaxnav.estimation.filters.innovation import nis_of
 from jaxnav.estimation.filters.wrapping import parted, require_wrapper
@@ -22,7 +23,6 @@ from jaxnav.estimation.types import (
     Params,
     flags_of,
 )
-from jaxnav.given import described
 
 
 class Gate(NamedTuple):

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxnav.arguments import require_array
 from jaxnav.estimation.checks import ROUNDING
 from jaxnav.estimation.debugging import check_covariance
 from jaxnav.estimation.types import Flag, Info, Model, Obs, SureObs, flags_of
-from jaxnav.given import require_array
 from jaxnav.numerics.conditioning import Solved, log_volume, solved, squared
 from jaxnav.numerics.linalg import Cholesky, kernel, log_det, normalised_square, solve_lower
 from jaxnav.numerics.roots import semidefinite_root

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import described, require_switch, require_whole
 from jaxnav.estimation.checks import require_filter_params, require_own
 from jaxnav.estimation.filters.innovation import (
     Measurement,
@@ -50,7 +51,6 @@ from jaxnav.estimation.types import (
     Params,
     Point,
 )
-from jaxnav.given import described, require_switch, require_whole
 from jaxnav.numerics.linalg import (
     Cholesky,
     cholesky,

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import NOT_NEGATIVE, POSITIVE, Domain, require_whole
 from jaxnav.estimation.filters.innovation import masked_innovation, measurement_of
 from jaxnav.estimation.filters.wrapping import (
     Builder,
@@ -30,7 +31,6 @@ from jaxnav.estimation.filters.wrapping import (
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Info, Input, Model, Obs
-from jaxnav.given import NOT_NEGATIVE, POSITIVE, Domain, require_whole
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower
 
 LEAST_WEIGHT = 1e-8

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import POSITIVE, require_switch
 from jaxnav.estimation.checks import require_ordered
 from jaxnav.estimation.filters.adaptive import softly_clamped
 from jaxnav.estimation.filters.innovation import mask_noise, masked_innovation, measurement_of
@@ -29,7 +30,6 @@ from jaxnav.estimation.filters.wrapping import (
     wrapped,
 )
 from jaxnav.estimation.types import Filter, FilterParams, Flag, Gaussian, Info, Input, Model, Obs
-from jaxnav.given import POSITIVE, require_switch
 from jaxnav.numerics.linalg import cholesky, matmul, solve_lower, symmetrise
 
 NoiseForm = Literal["clamped", "residual", "printed"]

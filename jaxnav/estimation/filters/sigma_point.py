@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxnav.arguments import FINITE, require_number, require_switch
 from jaxnav.estimation.checks import (
     require_filter_params,
     require_model,
@@ -49,7 +50,6 @@ from jaxnav.estimation.types import (
     Obs,
     Point,
 )
-from jaxnav.given import FINITE, require_number, require_switch
 from jaxnav.numerics.linalg import (
     cholesky,
     matmul,

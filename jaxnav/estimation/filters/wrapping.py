@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, TypeVar
 
 from jax import Array
 
+from jaxnav.arguments import Domain, described
 from jaxnav.estimation.checks import require_own, require_single
 from jaxnav.estimation.models import adapted
 from jaxnav.estimation.types import Filter, FilterParams, Input, Model, Params, Point
-from jaxnav.given import Domain, described
 
 Own = TypeVar("Own")
 Builder = Callable[[Model], Filter]

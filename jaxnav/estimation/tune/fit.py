@@ -10,9 +10,9 @@ import optax
 import scipy.optimize
 from jax import Array
 
+from jaxnav.arguments import described, require_function, require_whole
 from jaxnav.compiling import compiled
 from jaxnav.estimation.tune.transforms import POSITIVE, Coordinates, coordinates
-from jaxnav.given import described, require_function, require_whole
 
 Progress = Callable[[int, int, float], None]
 

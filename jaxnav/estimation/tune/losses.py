@@ -163,7 +163,7 @@ def negative_log_likelihood(
     return -jnp.mean(trace.record)
 
 
-def _log_likelihood(state: Any, info: Info) -> Array:
+def _log_likelihood(state: Any, info: Info | Mapping[str, Info]) -> Array:
     del state
     if isinstance(info, Mapping):
         raise ValueError(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxnav.given import described, require_leaves
+from jaxnav.arguments import described, require_leaves
 from jaxnav.numerics.linalg import cholesky
 
 

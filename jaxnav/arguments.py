@@ -78,6 +78,8 @@ def require_array(name: str, value: Any) -> Any:
 def as_array(name: str, value: Any) -> jax.Array:
     """Return numbers as an array, or raise ``ValueError`` for what has none."""
     try:
+        if isinstance(value, str):
+            raise TypeError("a text, which NumPy may take for the name of a type")
         return jnp.asarray(value)
     except (TypeError, ValueError):
         raise ValueError(
