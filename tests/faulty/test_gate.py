@@ -108,6 +108,35 @@ def test_what_goes_on_contradicting_is_let_in(name: str) -> None:
         assert np.max(np.abs(mean - TRUTH - [jump, 0, 0, 0])[late, :2]) < 5 * SIGMA[0]
 
 
+def refusals(alarm: float, runs: int, steps: int) -> np.ndarray:
+    """Refusals ``(runs, steps, groups)`` in flights drawn from the model of the filter."""
+    params = behind(PRIOR, Gate(false_alarm=alarm))
+    root, sigma = jnp.asarray(np.linalg.cholesky(Q)), jnp.asarray(SIGMA)
+
+    @compiled
+    def one(key: Any) -> Any:
+        first, process, noise = jax.random.split(key, 3)
+        w = jax.random.normal(process, (steps, 4)) @ root.T
+        v = jax.random.normal(noise, (steps, 4)) * sigma[None]
+        u = jnp.zeros((steps, 1))
+        _, z = jn.simulate(MODEL, PRIOR.model, jax.random.normal(first, (4,)), u, w, v)
+        filter = GATES["kf"]
+        return jn.run(filter, params, u, jn.observed(z), record=lambda _, info: info.refused).record
+
+    refused = np.asarray(jax.vmap(one)(jax.random.split(jax.random.key(4), runs)))
+    return refused[:, :, [group[0] for group in GROUPS]]
+
+
+def test_under_the_model_the_gate_refuses_by_its_probability() -> None:
+    """Exactly so before it has refused anything; after, its own filter has seen less."""
+    for alarm, runs in ((0.05, 20_000), (1e-3, 50_000)):
+        sigma = np.sqrt(alarm * (1 - alarm) / runs)
+        share = refusals(alarm, runs, 1).mean(axis=(0, 1))
+        assert np.all(np.abs(share - alarm) < 4 * sigma)
+    later = refusals(0.01, 500, 100).mean(axis=(0, 1))
+    np.testing.assert_allclose(later, 0.01, rtol=0.15)
+
+
 def test_patience_and_false_alarm_are_parameters() -> None:
     z = Z.copy()
     z[150:, 0] += 10.0
