@@ -345,8 +345,11 @@ def test_every_kth_record_is_that_of_the_whole_run() -> None:
             np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
         for a, b in zip(jax.tree.leaves(part.final), jax.tree.leaves(whole.final), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
-    for every in (0, -1, 5, 24):
-        with pytest.raises(ValueError, match=rf"every is {every}; 12 steps must be a multiple"):
+    for every, accepted in (
+        *((0, "it must be at least 1, and whole"), (-1, "it must be at least 1, and whole")),
+        *((5, "12 steps must be a multiple"), (24, "12 steps must be a multiple")),
+    ):
+        with pytest.raises(ValueError, match=f"every is {every}; {accepted}"):
             recorded(every, 0)
 
 

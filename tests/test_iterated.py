@@ -864,9 +864,9 @@ def test_gradient_by_the_noise_of_a_perfect_channel() -> None:
 
 def test_bad_arguments_are_named() -> None:
     for make in MAKERS.values():
-        with pytest.raises(ValueError, match=r"iterations = 0, trials = 6; .* at least one iter"):
+        with pytest.raises(ValueError, match="iterations is 0; it must be at least 1, and whole"):
             make(RANGING, iterations=0)
-        with pytest.raises(ValueError, match=r"iterations = 3, trials = -1; .* no negative number"):
+        with pytest.raises(ValueError, match="trials is -1; it must be at least 0, and whole"):
             make(RANGING, trials=-1)
     prior, obs = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in cases())
     for wrong, kind in ((0.5, "0.5"), (prior, "a Gaussian")):
