@@ -101,6 +101,10 @@ def test_derivatives_in_both_modes() -> None:
         ((np.eye(2), None, -np.ones(2), 0.1), "a variance of Qc is -1; it must not be negative"),
         ((np.eye(2), np.ones((3, 1)), np.ones(1), 1.0), "it must be (2, k)"),
         ((np.eye(2), np.ones((2, 1)), np.ones(2), 1.0), "it must be (1, 1) or (1,)"),
+        (
+            (np.eye(2), None, np.array([[1.0, 0.5], [0.0, 1.0]]), 0.1),
+            "Qc and its transpose differ by 0.5; it must be",
+        ),
     ],
 )
 def test_shapes_that_do_not_fit_are_refused(arguments: Any, sentence: str) -> None:

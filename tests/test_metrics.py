@@ -121,3 +121,14 @@ def test_nees_of_an_indefinite_covariance_is_nan():
     covariances[2, 0, 1] = covariances[2, 1, 0] = 2
     value = compiled(jax.vmap(nees, (None, 0)))(jnp.array([1.0, 2.0, 2.0]), covariances)
     np.testing.assert_array_equal(value, [9, np.nan, np.nan, np.nan])
+
+
+def test_probabilities_in_percent_are_refused() -> None:
+    for call in (
+        lambda: mean_interval(np.ones(3), 95.0),
+        lambda: rmse_ratio(np.ones(3), np.ones(3), 95.0),
+    ):
+        with pytest.raises(ValueError, match=r"^confidence is 95; it must be in \(0, 1\)$"):
+            call()
+    with pytest.raises(ValueError, match=r"^tail is 1; it must be in \(0, 1\)$"):
+        chi2_mean_bounds(3, 10, tail=1.0)

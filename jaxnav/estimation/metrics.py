@@ -8,7 +8,10 @@ import numpy as np
 from jax import Array
 from scipy.special import gammaincinv, stdtrit
 
+from jaxnav.arguments import require_number
 from jaxnav.numerics.linalg import cholesky, solve_lower
+
+_PROBABILITY = ("(0, 1)", 0.0, 1.0)
 
 
 class Measured(NamedTuple):
@@ -58,6 +61,7 @@ def rmse_ratio(
         denominator: ``(N,)`` mean squares of the same runs.
         confidence: Probability of the interval.
     """
+    require_number("confidence", confidence, *_PROBABILITY)
     a, b = np.mean(numerator), np.mean(denominator)
     value = float(np.sqrt(a / b))
     if numerator.size < 2:
@@ -76,6 +80,7 @@ def rmse_change(
 
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
     """Return the mean of ``(N,)`` values with the interval of Student's t."""
+    require_number("confidence", confidence, *_PROBABILITY)
     value = float(np.mean(values))
     if values.size < 2:
         return Interval(value, float("nan"), float("nan"))
@@ -118,6 +123,7 @@ def chi2_mean_bounds(degrees: int, runs: int, tail: float = 1e-6) -> tuple[float
     References:
         Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
     """
+    require_number("tail", tail, *_PROBABILITY)
     half = degrees * runs / 2
     low, high = 2 * gammaincinv(half, tail / 2), 2 * gammaincinv(half, 1 - tail / 2)
     return float(low) / runs, float(high) / runs

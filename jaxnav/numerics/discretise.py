@@ -98,3 +98,7 @@ def _require_real(given: dict[str, Array]) -> None:
     for name, value in {"dt": dt, "a variance of Qc": variances}.items():
         if not isinstance(value, Tracer) and value.size and not float(jnp.min(value)) >= 0:
             raise ValueError(f"{name} is {float(jnp.min(value)):g}; it must not be negative")
+    if Qc.ndim == 2 and not isinstance(Qc, Tracer) and Qc.shape[0] == Qc.shape[1]:
+        off = float(jnp.max(jnp.abs(Qc - Qc.T), initial=0.0))
+        if off > 1e-6 * float(jnp.max(jnp.abs(Qc), initial=0.0)):
+            raise ValueError(f"Qc and its transpose differ by {off:g}; it must be symmetric")
